@@ -1,0 +1,54 @@
+"""The goal API shared by every RISE environment: rewards and ends as pure functions of goals.
+
+The signatures are those of ``gymnasium_robotics.core.GoalEnv`` and accept single goals (D,) or batches
+(B, D), so that hindsight replay can relabel what was achieved.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+REWARD_TYPES = ("dense", "sparse")
+
+
+def distance(achieved_goal: NDArray, desired_goal: NDArray) -> NDArray:
+    """Euclidean distance (m) over the last axis."""
+    return np.linalg.norm(np.subtract(achieved_goal, desired_goal), axis=-1)
+
+
+def check_reward_type(reward_type: str) -> str:
+    """``reward_type`` itself; raises ``ValueError`` if it is unknown."""
+    if reward_type not in REWARD_TYPES:
+        raise ValueError(f"reward_type must be one of {REWARD_TYPES}, got {reward_type!r}")
+    return reward_type
+
+
+def reward(
+    achieved_goal: NDArray, desired_goal: NDArray, info: Any, goal_radius: float, reward_type: str
+) -> NDArray:
+    """Reward of arriving at ``achieved_goal``.
+
+    ``sparse``: 0 within ``goal_radius`` of the goal, −1 elsewhere. ``dense``: progress towards the goal in
+    this step in units of ``goal_radius``, plus 1 on reaching it. Progress needs where the step began:
+    ``info["previous_achieved_goal"]``, of one info or of each info in a batch.
+
+    Raises:
+        ValueError: dense reward without that entry (hindsight replay that drops the infos).
+    """
+    gap = distance(achieved_goal, desired_goal)
+    reached = gap <= goal_radius
+    if reward_type == "sparse":
+        return reached - 1.0
+    infos = [info] if isinstance(info, dict) else list(info)
+    try:
+        before = np.array([entry["previous_achieved_goal"] for entry in infos])
+    except KeyError:
+        raise ValueError(
+            "the dense reward needs info['previous_achieved_goal']: keep the infos "
+            "(HerReplayBuffer(copy_info_dict=True)) or make the environment with reward_type='sparse'"
+        ) from None
+    before = before[0] if isinstance(info, dict) else before
+    return (distance(before, desired_goal) - gap) / goal_radius + reached

@@ -1,0 +1,81 @@
+"""What an agent may know of an environment without making it: the meaning of its numbers.
+
+Every RISE environment class has a static method ``task(**kwargs) -> Task``. Agents, experts, noise wrappers
+and reports read this description, so that none of them names an environment.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Task:
+    """The description of one goal-reaching task among moving balls.
+
+    Shapes: B batch, S state, N obstacles, D dimensions, C = N·(2D + 1) reading channels.
+
+    Attributes:
+        dim: D, the dimension of positions: 2 or 3.
+        n_obstacles: N.
+        noise_scale: standard deviation of each reading channel at noise level 1, (C,), in SI units.
+        robot_radius: radius (m) of the ball around the reference point that stands for the robot.
+        goal_radius: distance (m) between reference point and goal that counts as reached.
+        dt: duration of a control step (s).
+        max_speed: greatest speed of the reference point (m/s), the scale of its motion.
+        pose: maps states (B, S) to the robot's frame: position (B, D) and rotation (B, D, D), whose columns
+            are the frame's axes in world coordinates.
+        body_state: columns of the state that keep their meaning when the world is seen from the robot.
+    """
+
+    dim: int
+    n_obstacles: int
+    noise_scale: tuple[float, ...]
+    robot_radius: float
+    goal_radius: float
+    dt: float
+    max_speed: float
+    pose: Callable[[Array], tuple[Array, Array]]
+    body_state: tuple[int, ...]
+
+    def split(self, reading: Array) -> tuple[Array, Array, Array]:
+        """Readings (B, C) as positions (B, N, D), velocities (B, N, D) and radii (B, N)."""
+        c = reading.reshape(-1, self.n_obstacles, 2 * self.dim + 1)
+        return c[..., : self.dim], c[..., self.dim : 2 * self.dim], c[..., -1]
+
+
+def env_class(env_id: str) -> Any:
+    """The class behind a registered environment id, found without making an environment.
+
+    Raises:
+        gymnasium.error.Error: the id is not registered.
+        ValueError: it is registered with something other than a class or a ``module:Class`` string.
+    """
+    entry = gym.spec(env_id).entry_point
+    if isinstance(entry, str):
+        module, _, name = entry.partition(":")
+        entry = getattr(importlib.import_module(module), name)
+    if not isinstance(entry, type):
+        raise ValueError(f"environment {env_id!r}: its entry point {entry!r} is no class")
+    return entry
+
+
+def task_of(env_id: str, **kwargs: Any) -> Task:
+    """The task description of a registered environment (``kwargs`` as for ``gymnasium.make``).
+
+    Raises:
+        ValueError: the environment publishes no task description.
+    """
+    described = getattr(env_class(env_id), "task", None)
+    if described is None:
+        raise ValueError(f"environment {env_id!r} describes no task: give its class a static method task()")
+    return described(**kwargs)
