@@ -12,7 +12,7 @@ import gymnasium as gym
 ENVS: dict[str, tuple[str, str | None, int]] = {
     "RISE-GroundVehicle-v0": (
         "rise_envs.ground_vehicle:GroundVehicleEnv",
-        "rise_envs.ground_vehicle:GroundVehicleVectorEnv",
+        "rise_envs.ground_vehicle_vector:GroundVehicleVectorEnv",
         200,
     ),
     "RISE-SafePanda-v0": ("rise_envs.safe_panda:SafePandaEnv", None, 50),

@@ -52,3 +52,14 @@ def reward(
         ) from None
     before = before[0] if isinstance(info, dict) else before
     return (distance(before, desired_goal) - gap) / goal_radius + reached
+
+
+def terminated(
+    achieved_goal: NDArray, desired_goal: NDArray, info: Any, goal_radius: float, on_collision: bool
+) -> NDArray:
+    """Whether the goal is reached or, with ``on_collision``, the step had a cost (of one info or of each)."""
+    ended = distance(achieved_goal, desired_goal) <= goal_radius
+    if not on_collision:
+        return ended
+    cost = info["cost"] if isinstance(info, dict) else [entry["cost"] for entry in info]
+    return ended | (np.asarray(cost) > 0)

@@ -54,8 +54,12 @@ def redraw(velocity: Array, key: NDArray[np.uint64], step: NDArray | int, motion
     """Velocities (B, N, D) for the coming step: new where a coin with the stated mean interval says so."""
     n = velocity.shape[1]
     coins = streams.split(key, 1)
-    counter = np.reshape(np.asarray(step, dtype=np.uint64), (-1, 1)) * np.uint64(n) + np.arange(n, dtype=np.uint64)
-    due = streams.uniform(np.reshape(coins, (-1, 1)), counter) < -np.expm1(-motion.dt / motion.redraw_interval)
+    counter = np.reshape(np.asarray(step, dtype=np.uint64), (-1, 1)) * np.uint64(n) + np.arange(
+        n, dtype=np.uint64
+    )
+    due = streams.uniform(np.reshape(coins, (-1, 1)), counter) < -np.expm1(
+        -motion.dt / motion.redraw_interval
+    )
     if not due.any():
         return velocity
     rows = due.any(axis=1)
