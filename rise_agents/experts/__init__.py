@@ -1,0 +1,54 @@
+"""Experts: what demonstrations are recorded from. They have the ``predict`` of a learned agent.
+
+A new expert is one file and one line in :data:`EXPERTS`. Its class is made as ``Class(task, seed=0)``.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+from rise_agents.agent import nearest
+from rise_envs.task import task_of
+
+EXPERTS: dict[tuple[str, str], str] = {
+    ("RISE-GroundVehicle-v0", "cbf"): "rise_agents.experts.vehicle_cbf:VehicleCBF",
+    ("RISE-GroundVehicle-v0", "mpc"): "rise_agents.experts.vehicle_mpc:VehicleMPC",
+    ("RISE-GroundVehicle-v0", "mixture"): "rise_agents.experts.mixture:Mixture",
+    ("RISE-SafePanda-v0", "cbf"): "rise_agents.experts.panda_cbf:PandaCBF",
+    ("RISE-SafePanda-v0", "mpc"): "rise_agents.experts.panda_mpc:PandaMPC",
+    ("RISE-SafePanda-v0", "mixture"): "rise_agents.experts.mixture:Mixture",
+}
+"""(environment id, expert's name) → ``module:Class``."""
+
+
+def expert_names(env_id: str) -> tuple[str, ...]:
+    """The names of the experts for an environment.
+
+    Raises:
+        ValueError: there are none; the message names the nearest environment that has some.
+    """
+    names = tuple(name for env, name in EXPERTS if env == env_id)
+    if not names:
+        known = sorted({env for env, _ in EXPERTS})
+        raise ValueError(f"no expert for environment {env_id!r}; {nearest(env_id, known)}")
+    return names
+
+
+def make_expert(name: str, env_id: str, seed: int = 0, **kwargs: Any) -> Any:
+    """An expert, ready to ``predict``.
+
+    Args:
+        name: one of :func:`expert_names`.
+        env_id: a registered environment.
+        seed: of an expert that draws random numbers.
+        **kwargs: of the environment's description, as for ``gymnasium.make`` (say ``n_obstacles=3``).
+
+    Raises:
+        ValueError: unknown name or environment.
+    """
+    names = expert_names(env_id)
+    if name not in names:
+        raise ValueError(f"no expert {name!r} for {env_id}; {nearest(name, names)}")
+    module, _, cls = EXPERTS[env_id, name].partition(":")
+    return getattr(importlib.import_module(module), cls)(task_of(env_id, **kwargs), seed=seed)
