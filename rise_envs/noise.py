@@ -1,0 +1,119 @@
+"""How a reading is corrupted: composable noise models, drawn for a whole batch of episodes at once.
+
+A noise model maps readings (B, C) to noisy readings (B, C), with C reading channels and B episodes side by
+side. All draws come from ``rise_envs.streams``: they are a function of the episode's noise key and the step,
+so an episode gets the same noise alone, in any batch and in any process. In text, a model is written
+``name:parameter``, and several are joined by a plus sign: ``step+dropout:0.3+delay:2``.
+
+========================= ================================================== =============================
+name:parameter (default)  effect                                             parameter at noise level λ
+========================= ================================================== =============================
+``step:deviation`` (1)    adds N(0, (deviation·scale)²), fresh in each step  deviation · λ
+``episode:deviation`` (1) adds one draw of that law, kept for the episode    deviation · λ
+``drift:rate`` (0.1)      adds a random walk, deviation rate·scale·√t at t   rate · λ
+``dropout:p`` (0.2)       with probability p the whole reading is lost and   1 − (1 − p)^λ
+                          the last one is held; never an episode's first
+``delay:steps`` (1)       the reading of so many steps ago (the first one    steps · λ, rounded, halves up
+                          until there is one so old)
+``quantise:pitch`` (1)    rounds to the nearest multiple of pitch·scale      pitch · λ
+========================= ================================================== =============================
+
+``scale`` (C,) is the unit of each channel: its standard deviation at level 1. Level 0 is the identity for
+every model, level 1 the model as written. ``a + b`` applies ``a``, then ``b`` to what ``a`` gave:
+``step+dropout`` holds the last *noisy* reading, ``dropout+step`` adds fresh noise to a held one. Each part
+has its own random stream.
+
+A new model is one subclass of :class:`NoiseModel` and one line in :data:`NOISE_MODELS`. The wrappers that put
+a model into an environment are in ``rise_envs.noise_wrappers``.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rise_envs.noise_models import (
+    Array,
+    Compose,
+    Delay,
+    Drift,
+    Dropout,
+    EpisodeBias,
+    Keys,
+    NoiseModel,
+    Quantise,
+    StepNoise,
+    require,
+)
+
+NOISE_MODELS: dict[str, Callable[..., NoiseModel]] = {
+    "step": StepNoise,
+    "episode": EpisodeBias,
+    "drift": Drift,
+    "dropout": Dropout,
+    "delay": Delay,
+    "quantise": Quantise,
+}
+
+
+def make_noise(noise: str | NoiseModel, level: float = 1.0) -> NoiseModel:
+    """The model that a text such as ``step+dropout:0.3+delay:2`` (or a model) stands for, at a noise level.
+
+    >>> make_noise("episode + delay:2", level=0.5)
+    Compose(parts=(EpisodeBias(deviation=0.5), Delay(steps=1)))
+
+    Raises:
+        ValueError: an unknown name (the nearest known one is suggested), a parameter that is no number or out
+            of range, a level that is negative or not finite.
+    """
+    require("noise_level", level)
+    if isinstance(noise, str):
+        # A plus sign before a digit belongs to a number, as in 1e+3.
+        models = [_make_part(part.strip(), noise) for part in re.split(r"\+(?!\d)", noise)]
+        noise = models[0] if len(models) == 1 else Compose(tuple(models))
+    if not isinstance(noise, NoiseModel):
+        raise ValueError(f"noise must be a NoiseModel or a text such as 'step+dropout:0.3', got {noise!r}")
+    # Without parts rather than with zeros in them: this leaves even the sign of −0.0 as it was.
+    return noise.at(level) if level > 0 else Compose(())
+
+
+def _make_part(text: str, whole: str) -> NoiseModel:
+    name, *values = text.split(":")
+    if name not in NOISE_MODELS:
+        near = difflib.get_close_matches(name, NOISE_MODELS, n=1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise ValueError(f"unknown noise model {name!r} in {whole!r}, known: {', '.join(NOISE_MODELS)}{hint}")
+    try:
+        numbers = [float(value) for value in values]
+    except ValueError:
+        raise ValueError(f"noise model {text!r}: what follows a ':' must be a number") from None
+    try:
+        return NOISE_MODELS[name](*(int(n) if n.is_integer() else n for n in numbers))
+    except TypeError:
+        raise ValueError(f"noise model {text!r}: too many parameters") from None
+
+
+def corrupt(noise: str | NoiseModel, readings: Array, scale: ArrayLike, keys: Keys) -> Array:
+    """Recorded readings (B, T, C) with noise, as the wrappers hand them out for the same keys.
+
+    Args:
+        noise: a model or its text.
+        readings: clean readings of B episodes in T steps, the first read at the reset.
+        scale: unit of each channel, (C,) or a scalar.
+        keys: noise key of each episode, (B,).
+
+    Returns:
+        Noisy readings, (B, T, C).
+    """
+    model = make_noise(noise)
+    n_episodes, n_steps, channels = readings.shape
+    unit = np.broadcast_to(np.asarray(scale, dtype=np.float64), channels)
+    state = model.reset(keys, channels)
+    noisy = np.empty(readings.shape)
+    for t in range(n_steps):
+        noisy[:, t], state = model(readings[:, t], unit, np.full(n_episodes, t), state)
+    return noisy

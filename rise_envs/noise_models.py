@@ -1,0 +1,287 @@
+"""The noise models themselves: frozen dataclasses, described in ``rise_envs.noise``."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rise_envs import streams
+
+Array = NDArray[np.float64]
+Keys = NDArray[np.uint64]
+Steps = NDArray[np.int64]
+State = tuple[Any, ...]  # what a model carries: a (nested) tuple of arrays, each with the batch first
+Noisy = tuple[Array, State]
+
+MAX_DELAY = 10_000  # steps; the readings on their way are kept in memory
+
+
+class NoiseModel(ABC):
+    """What every noise model offers. Shapes: B episodes, C reading channels."""
+
+    @abstractmethod
+    def at(self, level: float) -> NoiseModel:
+        """This model at noise level ``level`` (≥ 0); at level 0 it must be the identity."""
+
+    @abstractmethod
+    def reset(self, keys: Keys, channels: int, ahead: int = 1) -> State:
+        """The state at the start of B episodes.
+
+        Args:
+            keys: noise key of each episode, (B,).
+            channels: C.
+            ahead: how many steps to draw at once. Changes speed, not numbers: 64 suits one episode, 1 many.
+        """
+
+    @abstractmethod
+    def __call__(self, reading: Array, scale: Array, step: Steps, state: State) -> Noisy:
+        """Noisy readings (B, C) and the next state. No argument is changed.
+
+        Args:
+            reading: what would be read without this noise, (B, C).
+            scale: unit of each channel, (C,).
+            step: steps since each episode's reset, (B,): 0, 1, 2, … from call to call.
+            state: from :meth:`reset`, or from the call before.
+        """
+
+    def __add__(self, other: NoiseModel) -> Compose:
+        return Compose((*_parts(self), *_parts(other)))
+
+
+def _parts(model: NoiseModel) -> tuple[NoiseModel, ...]:
+    return model.parts if isinstance(model, Compose) else (model,)
+
+
+def require(name: str, value: Any, low: float = 0.0, high: float = math.inf) -> None:
+    """Raise ``ValueError`` unless ``value`` is a finite number in [low, high]."""
+    number = isinstance(value, int | float | np.integer | np.floating)
+    # A comparison with NaN is false, so that NaN is refused as well.
+    if not number or not low <= value <= high or math.isinf(value):
+        bounds = f"≥ {low:g}" if math.isinf(high) else f"in [{low:g}, {high:g}]"
+        raise ValueError(f"{name} must be a finite number {bounds}, got {value!r}")
+
+
+# Draws for the coming steps wait in the state as a block (B, ahead, C): an episode on its own then pays for
+# the array operations of a draw only once in `ahead` steps.
+def _draw_state(keys: Keys, channels: int, ahead: int) -> State:
+    return keys, np.zeros((len(keys), ahead, channels))
+
+
+def _draws(law: Callable[..., Array], step: Steps, state: State) -> Noisy:
+    """Draws (B, C) of ``law`` (``streams.normal`` or ``streams.uniform``) for this step."""
+    keys, block = state
+    _, ahead, channels = block.shape
+    phase = step % ahead
+    due = phase == 0
+    if due.any():
+        first = step[due, None].astype(np.uint64) * np.uint64(channels)
+        counter = first + np.arange(ahead * channels, dtype=np.uint64)  # step · C + channel
+        fresh = law(keys[due, None], counter).reshape(-1, ahead, channels)
+        if len(fresh) < len(block):
+            block = block.copy()
+            block[due] = fresh
+        else:
+            block = fresh
+    return block[np.arange(len(step)), phase], (keys, block)
+
+
+@dataclass(frozen=True)
+class StepNoise(NoiseModel):
+    """Independent Gaussian noise in every step and channel.
+
+    Attributes:
+        deviation: standard deviation in units of ``scale``.
+    """
+
+    deviation: float = 1.0
+
+    def __post_init__(self) -> None:
+        require("step: deviation", self.deviation)
+
+    def at(self, level: float) -> NoiseModel:
+        """The deviation times ``level``."""
+        return replace(self, deviation=self.deviation * level)
+
+    def reset(self, keys: Keys, channels: int, ahead: int = 1) -> State:
+        """The draws."""
+        return _draw_state(keys, channels, ahead)
+
+    def __call__(self, reading: Array, scale: Array, step: Steps, state: State) -> Noisy:
+        """The reading with a fresh error."""
+        draws, state = _draws(streams.normal, step, state)
+        return reading + self.deviation * scale * draws, state
+
+
+@dataclass(frozen=True)
+class EpisodeBias(NoiseModel):
+    """One Gaussian error per channel, drawn at the start of the episode and kept.
+
+    Attributes:
+        deviation: standard deviation over episodes, in units of ``scale``.
+    """
+
+    deviation: float = 1.0
+
+    def __post_init__(self) -> None:
+        require("episode: deviation", self.deviation)
+
+    def at(self, level: float) -> NoiseModel:
+        """The deviation times ``level``."""
+        return replace(self, deviation=self.deviation * level)
+
+    def reset(self, keys: Keys, channels: int, ahead: int = 1) -> State:
+        """The bias, (B, C), in units of its deviation."""
+        return (streams.normal(keys[:, None], np.arange(channels)),)
+
+    def __call__(self, reading: Array, scale: Array, step: Steps, state: State) -> Noisy:
+        """The reading with the episode's error."""
+        return reading + self.deviation * scale * state[0], state
+
+
+@dataclass(frozen=True)
+class Drift(NoiseModel):
+    """A Gaussian random walk in every channel that starts at 0.
+
+    Attributes:
+        rate: standard deviation of one step of the walk, in units of ``scale``.
+    """
+
+    rate: float = 0.1
+
+    def __post_init__(self) -> None:
+        require("drift: rate", self.rate)
+
+    def at(self, level: float) -> NoiseModel:
+        """The rate times ``level``."""
+        return replace(self, rate=self.rate * level)
+
+    def reset(self, keys: Keys, channels: int, ahead: int = 1) -> State:
+        """The walk so far, (B, C), in units of its rate; the draws."""
+        return np.zeros((len(keys), channels)), _draw_state(keys, channels, ahead)
+
+    def __call__(self, reading: Array, scale: Array, step: Steps, state: State) -> Noisy:
+        """The reading with the error that has grown so far."""
+        walk, draw_state = state
+        draws, draw_state = _draws(streams.normal, step, draw_state)
+        walk = walk + (step > 0)[:, None] * draws
+        return reading + self.rate * scale * walk, (walk, draw_state)
+
+
+@dataclass(frozen=True)
+class Dropout(NoiseModel):
+    """Readings get lost as a whole; the last one that arrived is held.
+
+    Attributes:
+        probability: of losing a reading, in every step but an episode's first.
+    """
+
+    probability: float = 0.2
+
+    def __post_init__(self) -> None:
+        require("dropout: probability", self.probability, 0.0, 1.0)
+
+    def at(self, level: float) -> NoiseModel:
+        """Level 2 loses a reading as often as two independent chances of losing it do."""
+        return replace(self, probability=1.0 - (1.0 - self.probability) ** level)
+
+    def reset(self, keys: Keys, channels: int, ahead: int = 1) -> State:
+        """The reading held, (B, C); the draws, one a step."""
+        return np.zeros((len(keys), channels)), _draw_state(keys, 1, ahead)
+
+    def __call__(self, reading: Array, scale: Array, step: Steps, state: State) -> Noisy:
+        """The last reading that arrived."""
+        held, draw_state = state
+        chance, draw_state = _draws(streams.uniform, step, draw_state)
+        lost = (chance < self.probability) & (step > 0)[:, None]
+        held = np.where(lost, held, reading)
+        return held, (held, draw_state)
+
+
+@dataclass(frozen=True)
+class Delay(NoiseModel):
+    """Readings arrive late.
+
+    Attributes:
+        steps: by how many steps.
+    """
+
+    steps: int = 1
+
+    def __post_init__(self) -> None:
+        require("delay: steps", self.steps, 0, MAX_DELAY)
+        if self.steps != int(self.steps):
+            raise ValueError(f"delay: steps must be a whole number, got {self.steps!r}")
+
+    def at(self, level: float) -> NoiseModel:
+        """The delay times ``level``, in whole steps."""
+        return replace(self, steps=math.floor(self.steps * level + 0.5))
+
+    def reset(self, keys: Keys, channels: int, ahead: int = 1) -> State:
+        """The readings on their way, (B, steps, C), oldest first."""
+        return (np.zeros((len(keys), int(self.steps), channels)),)
+
+    def __call__(self, reading: Array, scale: Array, step: Steps, state: State) -> Noisy:
+        """The oldest reading on its way."""
+        late = np.where((step == 0)[:, None, None], reading[:, None], state[0])
+        late = np.concatenate((late, reading[:, None]), axis=1)
+        return late[:, 0], (late[:, 1:],)
+
+
+@dataclass(frozen=True)
+class Quantise(NoiseModel):
+    """Readings on a grid through 0.
+
+    Attributes:
+        pitch: of the grid, in units of ``scale``; channels of ``scale`` 0 stay as they are.
+    """
+
+    pitch: float = 1.0
+
+    def __post_init__(self) -> None:
+        require("quantise: pitch", self.pitch)
+
+    def at(self, level: float) -> NoiseModel:
+        """The pitch times ``level``."""
+        return replace(self, pitch=self.pitch * level)
+
+    def reset(self, keys: Keys, channels: int, ahead: int = 1) -> State:
+        """Nothing."""
+        return ()
+
+    def __call__(self, reading: Array, scale: Array, step: Steps, state: State) -> Noisy:
+        """The nearest point of the grid."""
+        grid = self.pitch * scale
+        return np.where(grid > 0, np.rint(reading / np.where(grid > 0, grid, 1.0)) * grid, reading), state
+
+
+@dataclass(frozen=True)
+class Compose(NoiseModel):
+    """Models one after the other; without any it is the identity.
+
+    Attributes:
+        parts: in the order of their effect.
+    """
+
+    parts: tuple[NoiseModel, ...]
+
+    def at(self, level: float) -> NoiseModel:
+        """Every part at ``level``."""
+        return replace(self, parts=tuple(part.at(level) for part in self.parts))
+
+    def reset(self, keys: Keys, channels: int, ahead: int = 1) -> State:
+        """The parts' states, each on its own stream."""
+        return tuple(p.reset(streams.split(keys, i), channels, ahead) for i, p in enumerate(self.parts))
+
+    def __call__(self, reading: Array, scale: Array, step: Steps, state: State) -> Noisy:
+        """What the last part gives."""
+        after = []
+        for part, before in zip(self.parts, state, strict=True):
+            reading, now = part(reading, scale, step, before)
+            after.append(now)
+        return reading, tuple(after)

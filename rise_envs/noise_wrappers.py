@@ -1,0 +1,302 @@
+"""Noisy observations for any Gymnasium environment: :class:`ObservationNoise` and its twin for batches.
+
+Both follow the same rules.
+
+- **What is noised.** ``keys`` of a Dict observation (default: ``obstacle``, where there is one), or the whole
+  of a Box. Everything else, goals included, passes untouched. Noised parts get the space (−∞, ∞).
+- **How much.** ``noise_level`` × ``noise_scale``, the latter per channel: an argument (a number, an array
+  that broadcasts to the Box, or a dict of these), else the dict ``env.unwrapped.noise_scale`` where the
+  environment publishes one, else 1.
+- **Reproducible, and apart from the environment.** ``reset(seed=s)`` seeds the noise's own stream, further
+  resets go on with it, and ``reset(options={"noise_seed": n})`` names the noise of one episode whatever the
+  seed. The environment's random numbers are not touched: it moves the same with and without noise.
+- **Truth.** ``info["clean_observation"]`` is a copy of the whole observation without noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.utils import RecordConstructorArgs
+from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from rise_envs import streams
+from rise_envs.noise import make_noise
+from rise_envs.noise_channels import Channels, Scale, own_copy
+from rise_envs.noise_models import Array, Keys, NoiseModel, State
+
+Rows = NDArray[np.bool_]
+
+# Tags of key streams: they keep apart the noise of reset(seed=n), that of the noise seed n, and the
+# environment with seed n. Not 0: to NumPy the entropy (n, 0) is the same as n.
+_STREAM, _EPISODE = 0x6E6F6973, 0x65706973
+
+
+class NoiseRows:
+    """The noise of B episodes that run side by side, each with its own key stream and clock."""
+
+    def __init__(self, model: NoiseModel, scale: Array, n: int, ahead: int) -> None:
+        self.model, self.scale, self._ahead = model, scale, ahead
+        self._stream = np.random.SeedSequence().generate_state(n, np.uint64)
+        self._episode = np.zeros(n, dtype=np.uint64)
+        self._step = np.zeros(n, dtype=np.int64)
+        self._state: State | None = None
+
+    def seed(self, row: int, seed: int) -> None:
+        """Let the stream of one row begin anew, as ``seed`` names it."""
+        self._stream[row], self._episode[row] = streams.key_from_seed(seed, _STREAM), 0
+
+    def start(self, reading: Array, rows: Rows, noise_seeds: Sequence[int] | None = None) -> Array:
+        """Begin episodes in the given rows (B,): their first noisy readings, (rows.sum(), C).
+
+        Args:
+            reading: the first clean readings, (B, C); only the given rows are looked at.
+            rows: which rows, (B,).
+            noise_seeds: B seeds that name the noise of these episodes, instead of the rows' own streams.
+        """
+        if self._state is None and not rows.all():
+            raise gym.error.ResetNeeded("the first reset() must start every environment")
+        if noise_seeds is None:
+            keys: Keys = streams.bits(self._stream[rows], self._episode[rows])
+            self._episode[rows] += np.uint64(1)
+        else:
+            chosen = [streams.key_from_seed(noise_seeds[i], _EPISODE) for i in np.flatnonzero(rows).tolist()]
+            keys = np.array(chosen, dtype=np.uint64)
+        self._step[rows] = 0
+        fresh = self.model.reset(keys, reading.shape[1], self._ahead)
+        noisy, fresh = self.model(reading[rows], self.scale, self._step[rows], fresh)
+        self._state = fresh if rows.all() else _put(self._state, fresh, rows)
+        return noisy
+
+    def advance(self, reading: Array) -> Array:
+        """Noisy readings (B, C) of the step that led to ``reading`` (B, C)."""
+        if self._state is None:
+            raise gym.error.ResetNeeded("call reset() before step()")
+        self._step = self._step + 1
+        noisy, self._state = self.model(reading, self.scale, self._step, self._state)
+        return noisy
+
+
+def _put(state: Any, fresh: Any, rows: Rows) -> Any:
+    """``state`` (B rows) with the given rows taken from ``fresh`` (those rows only)."""
+    if isinstance(state, tuple):
+        return tuple(_put(part, new, rows) for part, new in zip(state, fresh, strict=True))
+    merged = state.copy()
+    merged[rows] = fresh
+    return merged
+
+
+def _noise_seeds(options: dict[str, Any] | None, n: int) -> tuple[list[int] | None, dict[str, Any] | None]:
+    """The noise seeds (``n`` of them) named in reset's options, and the options without them."""
+    if not options or "noise_seed" not in options:
+        return None, options
+    rest = {key: value for key, value in options.items() if key != "noise_seed"}
+    if options["noise_seed"] is None:
+        return None, rest or None
+    seeds = np.asarray(options["noise_seed"])
+    if seeds.shape not in ((), (n,)) or seeds.dtype.kind not in "iu" or (seeds < 0).any():
+        raise ValueError(
+            f"options['noise_seed'] must be a whole number ≥ 0 (or {n} of them, one for each environment), "
+            f"got {options['noise_seed']!r}"
+        )
+    return np.broadcast_to(seeds, n).tolist(), rest or None
+
+
+class ObservationNoise(gym.Wrapper, RecordConstructorArgs):
+    """Any environment, its observation read with noise. The rules are at the top of this module.
+
+    An environment whose ``unwrapped.perceived`` exists (the RISE ones) finds its noisy ``obstacle`` reading
+    there, to draw it.
+
+    >>> env = ObservationNoise(gym.make("CartPole-v1"), "step+delay:2", noise_scale=[0.1, 0.2, 0.01, 0.2])
+    >>> observation, info = env.reset(seed=0)
+    >>> observation.dtype, sorted(info)
+    (dtype('float32'), ['clean_observation'])
+
+    Args:
+        env: an environment with a Box observation of floats, or a Dict with such parts.
+        noise: a model, or a text such as ``"episode"`` or ``"step+dropout:0.3"`` (see ``rise_envs.noise``).
+        keys: which parts of a Dict observation are noised.
+        noise_level: multiplies the noise; 0 is none.
+        noise_scale: standard deviation of each channel at level 1.
+
+    Raises:
+        ValueError: arguments that do not fit each other, the environment or their ranges.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env,
+        noise: str | NoiseModel = "step",
+        keys: str | Sequence[str] | None = None,
+        noise_level: float = 1.0,
+        noise_scale: Scale | None = None,
+    ) -> None:
+        RecordConstructorArgs.__init__(
+            self, noise=noise, keys=keys, noise_level=noise_level, noise_scale=noise_scale
+        )
+        gym.Wrapper.__init__(self, env)
+        self.channels = Channels.of(env.observation_space, keys)
+        self.observation_space = self.channels.noisy_space(env.observation_space)
+        scale = self.channels.scale(noise_scale, getattr(env.unwrapped, "noise_scale", None))
+        self._rows = NoiseRows(make_noise(noise, noise_level), scale, 1, ahead=64)
+        named = dict(zip(self.channels.keys or (), self.channels.spans, strict=False))
+        self._base: Any = env.unwrapped
+        self._obstacle = named.get("obstacle") if hasattr(self._base, "perceived") else None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start an episode and its noise; ``options["noise_seed"]`` names the noise apart from ``seed``.
+
+        Raises:
+            ValueError: a noise seed that is no whole number ≥ 0.
+        """
+        noise_seeds, options = _noise_seeds(options, 1)
+        observation, info = self.env.reset(seed=seed, options=options)
+        if seed is not None:
+            self._rows.seed(0, int(seed))
+        reading = self.channels.read(observation)
+        noisy = self._rows.start(reading, np.ones(1, dtype=bool), noise_seeds)
+        return self._hand_out(observation, noisy, info)
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Step the environment; its observation is read with noise, the last one of an episode too."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        noisy = self._rows.advance(self.channels.read(observation))
+        observation, info = self._hand_out(observation, noisy, info)
+        return observation, reward, terminated, truncated, info
+
+    def _hand_out(self, clean: Any, noisy: Array, info: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
+        if self._obstacle is not None:
+            self._base.perceived = noisy[0, self._obstacle].copy()
+        return self.channels.write(clean, noisy), {**info, "clean_observation": own_copy(clean)}
+
+
+class VectorObservationNoise(VectorWrapper, RecordConstructorArgs):
+    """Any vector environment, its observations read with noise: the twin of :class:`ObservationNoise`.
+
+    It hands out what a ``SyncVectorEnv`` of environments wrapped one by one would, number for number, in all
+    three autoreset modes: for one seed, a list of seeds, ``options["noise_seed"]`` (one for all, or B of
+    them) and ``options["reset_mask"]``. With ``SAME_STEP``, ``infos["final_obs"]`` is noised as the last
+    observation of its episode, and its clean form is in ``infos["final_info"]["clean_observation"]``.
+    ``infos["clean_observation"]`` is the clean batch (an array, or a dict of arrays) with Gymnasium's masks.
+
+    Args:
+        env: any vector environment: sync, async or native.
+        noise: as in :class:`ObservationNoise`, and so are ``keys``, ``noise_level`` and ``noise_scale``.
+        keys: see there.
+        noise_level: see there.
+        noise_scale: see there.
+
+    Raises:
+        ValueError: as in :class:`ObservationNoise`, or no autoreset mode in the environment's metadata.
+    """
+
+    def __init__(
+        self,
+        env: VectorEnv,
+        noise: str | NoiseModel = "step",
+        keys: str | Sequence[str] | None = None,
+        noise_level: float = 1.0,
+        noise_scale: Scale | None = None,
+    ) -> None:
+        RecordConstructorArgs.__init__(
+            self, noise=noise, keys=keys, noise_level=noise_level, noise_scale=noise_scale
+        )
+        VectorWrapper.__init__(self, env)
+        try:
+            self._mode = AutoresetMode(env.metadata["autoreset_mode"])
+        except (KeyError, ValueError):
+            raise ValueError(f"{env}: metadata['autoreset_mode'] must be a gymnasium AutoresetMode") from None
+        self.channels = Channels.of(env.single_observation_space, keys)
+        self.single_observation_space = self.channels.noisy_space(env.single_observation_space)
+        self.observation_space = batch_space(self.single_observation_space, env.num_envs)
+        scale = self.channels.scale(noise_scale, _published_scale(env) if noise_scale is None else None)
+        self._rows = NoiseRows(make_noise(noise, noise_level), scale, env.num_envs, ahead=1)
+        self._noisy: Array | None = None  # as last handed out
+        self._done = np.zeros(env.num_envs, dtype=bool)
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start all episodes, or those of ``options["reset_mask"]``, and their noise.
+
+        Raises:
+            ValueError: noise seeds that are not whole numbers ≥ 0, or not B of them.
+        """
+        n = self.num_envs
+        noise_seeds, options = _noise_seeds(options, n)
+        rows = np.array((options or {}).get("reset_mask", np.ones(n, dtype=bool)))
+        # The environment may pop the mask from its options: they get a dict of their own.
+        clean, infos = self.env.reset(seed=seed, options=dict(options) if options else options)  # type: ignore[arg-type]
+        if seed is not None:
+            seeds = [seed + i for i in range(n)] if isinstance(seed, int | np.integer) else seed
+            for i, wanted in enumerate(seeds):
+                if rows[i] and wanted is not None:
+                    self._rows.seed(i, int(wanted))
+        reading = self.channels.read(clean, n)
+        noisy = reading if self._noisy is None else self._noisy.copy()
+        noisy[rows] = self._rows.start(reading, rows, noise_seeds)
+        self._done = self._done & ~rows
+        self._noisy = noisy
+        return self.channels.write(clean, noisy, (n,)), {**infos, **self._clean_info(clean, rows)}
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Step all environments; rows that the environment resets begin a new episode of noise."""
+        n = self.num_envs
+        clean, rewards, terminated, truncated, infos = self.env.step(actions)
+        reading = self.channels.read(clean, n)
+        ended = np.asarray(terminated, dtype=bool) | np.asarray(truncated, dtype=bool)
+        infos = {**infos, **self._clean_info(clean, np.ones(n, dtype=bool))}
+        if self._mode == AutoresetMode.SAME_STEP and ended.any():
+            noisy, infos = self._end_and_start(reading, ended, infos)
+        else:
+            noisy = self._rows.advance(reading)
+            if self._mode == AutoresetMode.NEXT_STEP and self._done.any():
+                noisy = noisy.copy()
+                noisy[self._done] = self._rows.start(reading, self._done)
+        self._done, self._noisy = ended, noisy
+        return self.channels.write(clean, noisy, (n,)), rewards, terminated, truncated, infos
+
+    def _end_and_start(
+        self, reading: Array, ended: Rows, infos: dict[str, Any]
+    ) -> tuple[Array, dict[str, Any]]:
+        """A step in which ``ended`` rows give their last observation and the first of a new episode."""
+        if "final_obs" not in infos:
+            raise ValueError(f"{self.env} resets in the same step, but gives no infos['final_obs']")
+        finals = {i: infos["final_obs"][i] for i in np.flatnonzero(ended).tolist()}
+        last = reading.copy()
+        for i, observation in finals.items():
+            last[i] = self.channels.read(observation)
+        noisy = self._rows.advance(last).copy()
+
+        final_obs, final_info = infos["final_obs"].copy(), dict(infos.get("final_info", {}))
+        for i, observation in finals.items():
+            final_obs[i] = self.channels.write(observation, noisy[i : i + 1])
+            final_info = self._add_info(final_info, {"clean_observation": own_copy(observation)}, i)
+        noisy[ended] = self._rows.start(reading, ended)
+        return noisy, {**infos, "final_obs": final_obs, "final_info": final_info, "_final_info": ended.copy()}
+
+    def _clean_info(self, clean: Any, rows: Rows) -> dict[str, Any]:
+        """The clean observations in the form that Gymnasium gives to infos, with masks of who has one."""
+        values = own_copy(clean)
+        if isinstance(values, dict):
+            values |= {f"_{key}": rows.copy() for key in clean}
+        return {"clean_observation": values, "_clean_observation": rows.copy()}
+
+
+def _published_scale(env: VectorEnv) -> Any:
+    """``noise_scale`` as the vector environment or its first sub-environment publishes it, else ``None``."""
+    base = env.unwrapped
+    if hasattr(base, "noise_scale"):
+        return base.noise_scale
+    # Asking first: an attribute that is missing in a worker process would end that worker.
+    if hasattr(base, "call") and all(base.call("has_wrapper_attr", "noise_scale")):
+        return base.call("get_wrapper_attr", "noise_scale")[0]
+    return None
