@@ -1,0 +1,67 @@
+"""Agents that imitate or learn to reach goals safely from noisy readings.
+
+>>> from rise_agents import make_agent, load_agent
+>>> agent = make_agent("rise", "RISE-GroundVehicle-v0", seed=0)
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+from typing import Any
+
+from rise_agents.agent import Agent, nearest
+
+# name -> "module:Class". A new agent is one file and one line here.
+AGENTS: dict[str, str] = {
+    "rise": "rise_agents.rise:Rise",
+    "pcbc": "rise_agents.pcbc:PCBC",
+    "cppo": "rise_agents.cppo:CPPO",
+}
+
+
+def agent_class(name: str) -> Any:
+    """The class of a registered agent.
+
+    Raises:
+        ValueError: an unknown name, with the nearest known one.
+    """
+    if name not in AGENTS:
+        raise ValueError(f"unknown agent {name!r}: {nearest(name, AGENTS)}")
+    module, _, kind = AGENTS[name].partition(":")
+    return getattr(importlib.import_module(module), kind)
+
+
+def make_agent(
+    name: str, env_id: str, config: dict[str, Any] | None = None, seed: int = 0, device: str = "cpu"
+) -> Agent:
+    """An untrained agent for an environment.
+
+    Args:
+        name: a key of ``AGENTS``.
+        env_id: a registered environment.
+        config: settings that differ from the agent's defaults, by the field names of its ``Config``.
+        seed: of weights, batches and samples.
+        device: a torch device.
+
+    Raises:
+        ValueError: an unknown agent or setting, or a setting out of range.
+    """
+    return agent_class(name)(env_id, config or {}, seed, device)
+
+
+def load_agent(path: str | os.PathLike[str], env_id: str | None = None, device: str = "cpu") -> Agent:
+    """A trained agent from a checkpoint (of ``env_id``, if that is given).
+
+    Raises:
+        rise_agents.checkpoint.CheckpointError: unreadable, damaged, or of another environment.
+    """
+    from rise_agents import checkpoint
+
+    arrays, description = checkpoint.load(path)
+    name, env = description.get("agent"), description.get("env")
+    if name not in AGENTS:
+        raise checkpoint.CheckpointError(path, f"holds an unknown agent {name!r}", "update the package")
+    if env_id is not None and env != env_id:
+        raise checkpoint.CheckpointError(path, f"was trained on {env!r}, not {env_id!r}", "train on that environment")
+    return agent_class(name).from_checkpoint(arrays, description, device)

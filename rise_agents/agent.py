@@ -1,0 +1,129 @@
+"""What every agent is: something that learns, predicts, and can be stored.
+
+``predict`` has the signature of stable-baselines3, batched and single alike, so its tools (``evaluate_policy``)
+accept every agent and every expert. ``state`` is None or a tuple of arrays with the batch first; a rollout can
+therefore exchange single rows. An agent that draws random numbers keeps one key and one counter per row in its
+state, so that what it does in an episode depends on the episode's key only, not on its neighbours.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, fields
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rise_envs import streams
+
+State = tuple[NDArray, ...] | None
+# Reports training progress: (share done in [0, 1], named figures of this moment).
+Progress = Callable[[float, dict[str, float]], None]
+
+
+def silent(share: float, figures: dict[str, float]) -> None:
+    """Progress that nobody watches."""
+
+
+@runtime_checkable
+class Policy(Protocol):
+    """Anything that acts: agents and experts."""
+
+    def predict(
+        self,
+        observation: Any,
+        state: State = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray, State]:
+        """Actions for one observation or a batch, and the state to hand in with the next one."""
+
+
+class Agent(Policy, Protocol):
+    """A policy that learns and can be stored.
+
+    Attributes:
+        learns_from: ``"demonstrations"`` or ``"environment"``, what :meth:`learn` is given.
+        evaluate_deterministic: how the agent is meant to act when it is judged.
+    """
+
+    learns_from: str
+    evaluate_deterministic: bool
+
+    def learn(self, source: Any, progress: Progress = silent) -> Agent:
+        """Train on demonstrations, or in the environment whose id is given."""
+
+    def save(self, path: str) -> None:
+        """Store everything that :func:`rise_agents.load_agent` needs."""
+
+
+def initial_state(policy: Any, keys: NDArray[np.uint64]) -> State:
+    """The state of ``policy`` at the start of the episodes with the given keys (B,); None if it keeps none."""
+    start = getattr(policy, "initial_state", None)
+    return start(keys) if start else None
+
+
+def merge_states(old: State, new: State, rows: NDArray[np.bool_]) -> State:
+    """``old`` with the given ``rows`` (B,) bool taken from ``new``."""
+    if old is None or new is None:
+        return new
+    return tuple(
+        np.where(rows.reshape((-1,) + (1,) * (a.ndim - 1)), b, a) for a, b in zip(old, new, strict=True)
+    )
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """A hint for an error line: the closest known name, and all of them."""
+    known = sorted(known)
+    close = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
+    hint = f"did you mean {close[0]!r}? " if close else ""
+    return f"{hint}known: {', '.join(known)}"
+
+
+def config_from_dict(kind: type, values: dict[str, Any]) -> Any:
+    """A validated config dataclass from a plain dict.
+
+    Raises:
+        ValueError: an unknown key, with the nearest known one.
+    """
+    known = {field.name for field in fields(kind)}
+    for key in values:
+        if key not in known:
+            raise ValueError(f"unknown setting {key!r}: {nearest(key, known)}")
+    plain = {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
+    return kind(**plain)
+
+
+def config_to_dict(config: Any) -> dict[str, Any]:
+    """The inverse of :func:`config_from_dict`, fit for JSON."""
+    return {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(config).items()}
+
+
+def require(condition: bool, what: str, value: Any) -> None:
+    """Raise ``ValueError`` that says what a setting must be and what it was."""
+    if not condition:
+        raise ValueError(f"{what}, got {value!r}")
+
+
+def fresh_state(keys: NDArray[np.uint64]) -> State:
+    """The state of a policy that draws: a key and a counter for each row."""
+    return np.asarray(keys, np.uint64), np.zeros(len(keys), np.uint64)
+
+
+def draw_state(
+    state: State, episode_start: NDArray[np.bool_] | None, rows: int, rng: np.random.Generator
+) -> tuple[NDArray[np.uint64], NDArray[np.uint64]]:
+    """Keys and counters (B,) to draw with: new ones without a state, a derived key where an episode starts.
+
+    A row whose counter is zero has not drawn yet, so the start of its first episode changes nothing.
+    """
+    if state is None:
+        state = fresh_state(rng.integers(0, 2**64, rows, dtype=np.uint64))
+    keys, counter = state
+    starts = np.zeros(rows, bool) if episode_start is None else np.atleast_1d(episode_start) & (counter > 0)
+    if starts.any():
+        keys = np.where(starts, streams.bits(keys, counter), keys)
+        counter = np.where(starts, np.uint64(0), counter)
+    return keys, counter

@@ -1,0 +1,196 @@
+"""What cloned policies share: data in a frame, units of actions, the imitation loss, storage.
+
+Shapes: B batch, M samples, T transitions, R robot inputs, C reading inputs, A actions.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from rise_agents import checkpoint, readings
+from rise_agents.agent import config_to_dict, require
+from rise_agents.demonstrations import Demonstrations
+from rise_agents.readings import Standardiser
+from rise_envs.task import Task, env_class, task_of
+
+LOSSES = ("mse", "nll")
+
+
+@dataclass(frozen=True)
+class CloningConfig:
+    """Settings of every cloned policy.
+
+    Attributes:
+        frame: how observations are seen: ``world``, ``body`` or ``features`` (see :mod:`rise_agents.readings`).
+        hidden: widths of the policy's hidden layers.
+        loss: ``mse``, or ``nll`` for a Gaussian policy with a learned deviation (it acts with its mean).
+        updates: gradient steps of the policy.
+        batch_size: transitions per step.
+        learning_rate: of Adam, decayed to zero by a cosine.
+        transitions: use only the first so many transitions (None: all).
+    """
+
+    frame: str = "body"
+    hidden: tuple[int, ...] = (128, 128)
+    loss: str = "mse"
+    updates: int = 20_000
+    batch_size: int = 256
+    learning_rate: float = 1e-3
+    transitions: int | None = None
+
+    def __post_init__(self) -> None:
+        require(self.frame in readings.FRAMES, f"frame must be one of {readings.FRAMES}", self.frame)
+        require(self.loss in LOSSES, f"loss must be one of {LOSSES}", self.loss)
+        require(all(width >= 1 for width in self.hidden), "hidden must hold positive widths", self.hidden)
+        for name in ("updates", "batch_size"):
+            require(getattr(self, name) >= 1, f"{name} must be at least 1", getattr(self, name))
+        require(self.learning_rate > 0, "learning_rate must be positive", self.learning_rate)
+        require(self.transitions is None or self.transitions >= 1, "transitions must be positive", self.transitions)
+
+
+@dataclass(frozen=True)
+class ActionUnits:
+    """Actions between their bounds and [−1, 1]."""
+
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, env_id: str) -> ActionUnits:
+        """The bounds of a registered environment's actions."""
+        space = env_class(env_id)(render_mode=None).action_space
+        return cls(space.low.astype(np.float64), space.high.astype(np.float64))
+
+    def to_unit(self, action: NDArray) -> NDArray[np.float64]:
+        """Actions in their own units to [−1, 1]."""
+        return 2 * (action - self.low) / (self.high - self.low) - 1
+
+    def to_action(self, unit: NDArray) -> NDArray[np.float32]:
+        """Clipped to [−1, 1] and back to the action's own units, inside the bounds."""
+        action = self.low + (np.clip(unit, -1.0, 1.0) + 1) * 0.5 * (self.high - self.low)
+        return np.clip(action, self.low, self.high).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class CloningData:
+    """Demonstrations as tensors on the training device, in standard units."""
+
+    robot: Tensor  # (T, R)
+    reading: Tensor  # (T, C)
+    action: Tensor  # (T, A), in [−1, 1]
+
+
+@dataclass(frozen=True)
+class Eyes:
+    """How a cloned policy sees observations: the frame, and the units fitted to its demonstrations."""
+
+    task: Task
+    frame: str
+    robot: Standardiser
+    reading: Standardiser
+
+    @classmethod
+    def fit(cls, task: Task, frame: str, demonstrations: Demonstrations) -> Eyes:
+        """Units in which the demonstrations have zero mean and unit variance."""
+        robot, reading = readings.inputs(task, frame, demonstrations.observations)
+        return cls(task, frame, Standardiser.fit(robot), Standardiser.fit(reading))
+
+    def __call__(self, observation: dict[str, NDArray]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Batched observations to robot inputs (B, R) and reading inputs (B, C)."""
+        robot, reading = readings.inputs(self.task, self.frame, observation)
+        return self.robot(robot), self.reading(reading)
+
+    def arrays(self) -> dict[str, NDArray]:
+        """The numbers to store."""
+        return {**self.robot.arrays("eyes.robot"), **self.reading.arrays("eyes.reading")}
+
+    @classmethod
+    def from_arrays(cls, task: Task, frame: str, arrays: dict[str, NDArray]) -> Eyes:
+        """The inverse of :meth:`arrays`."""
+        robot, reading = (Standardiser.from_arrays(arrays, f"eyes.{part}") for part in ("robot", "reading"))
+        return cls(task, frame, robot, reading)
+
+
+def prepare(
+    demonstrations: Demonstrations, eyes: Eyes, units: ActionUnits, limit: int | None, device: str
+) -> CloningData:
+    """Demonstrations on the training device, all at once."""
+    rows = slice(None if limit is None else min(limit, len(demonstrations.actions)))
+    observations = {key: value[rows] for key, value in demonstrations.observations.items()}
+    parts = (*eyes(observations), units.to_unit(demonstrations.actions[rows]).astype(np.float32))
+    return CloningData(*(torch.from_numpy(part).to(device) for part in parts))
+
+
+def imitation_loss(output: Tensor, action: Tensor, kind: str) -> Tensor:
+    """ℓ(â, a), averaged over everything but the last axis, which is summed.
+
+    Args:
+        output: (…, B, A) actions, or (…, B, 2A) means and log deviations for ``nll``.
+        action: the expert's actions, (B, A).
+        kind: ``mse`` or ``nll``.
+    """
+    if kind == "mse":
+        return ((output - action) ** 2).sum(-1).mean()
+    mean, log_std = output.chunk(2, -1)
+    log_std = log_std.clamp(-5.0, 2.0)
+    return (0.5 * ((action - mean) / log_std.exp()) ** 2 + log_std).sum(-1).mean()
+
+
+def output_size(actions: int, kind: str) -> int:
+    """Width of the policy's last layer."""
+    return actions if kind == "mse" else 2 * actions
+
+
+def seeded(seed: int, device: str) -> torch.Generator:
+    """A generator on the training device; also seeds the initial weights of modules made from here on."""
+    torch.manual_seed(seed)
+    torch.set_num_threads(1)  # a second thread makes networks of this size slower, not faster
+    return torch.Generator(device=device).manual_seed(seed)
+
+
+def check_source(source: Any, env_id: str, name: str) -> Demonstrations:
+    """``source`` as demonstrations of the agent's own environment.
+
+    Raises:
+        ValueError: something else, or demonstrations of another environment.
+    """
+    if not isinstance(source, Demonstrations):
+        raise ValueError(f"{name} learns from Demonstrations, got {type(source).__name__}")
+    if source.env_id != env_id:
+        raise ValueError(f"{name} for {env_id!r} was given demonstrations of {source.env_id!r}")
+    return source
+
+
+def save(path: str | os.PathLike[str], agent: Any, arrays: dict[str, NDArray]) -> None:
+    """Store a cloned agent."""
+    description = {
+        "agent": agent.name,
+        "env": agent.env_id,
+        "seed": agent.seed,
+        "config": config_to_dict(agent.config),
+    }
+    checkpoint.save(path, arrays, description)
+
+
+def untrained(name: str) -> RuntimeError:
+    """The error of an agent that acts before it has learned."""
+    return RuntimeError(f"this {name} has no weights yet: call learn(demonstrations) or load a checkpoint")
+
+
+def make_task(env_id: str) -> Task:
+    """The task of an environment (importing :mod:`rise_envs` first, so that its ids are known)."""
+    import rise_envs  # noqa: F401
+
+    return task_of(env_id)
+
+
+def move(module: nn.Module, device: str) -> nn.Module:
+    """``module`` on ``device``, ready to train."""
+    return module.to(device).train()

@@ -1,0 +1,47 @@
+"""The three networks of the paper: multilayer perceptron, Gaussian encoder, decoder.
+
+Shapes: B batch, M samples, C reading inputs, Z latent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+# σ stays in [e⁻⁷, e³]: wide enough for any unit, finite in float32 whatever the reading.
+LOG_SIGMA_RANGE = (-7.0, 3.0)
+
+
+def mlp(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequential:
+    """Fully connected layers with ReLU between them, (…, inputs) → (…, outputs)."""
+    widths = [inputs, *hidden]
+    layers: list[nn.Module] = []
+    for width, following in zip(widths[:-1], widths[1:], strict=True):
+        layers += [nn.Linear(width, following), nn.ReLU()]
+    return nn.Sequential(*layers, nn.Linear(widths[-1], outputs))
+
+
+class Encoder(nn.Module):
+    """q_φ(z | c): ReLU layers that culminate in parallel outputs for μ and log σ (paper, section III-B)."""
+
+    def __init__(self, inputs: int, hidden: Sequence[int], latent: int) -> None:
+        super().__init__()
+        self.trunk = nn.Sequential(*list(mlp(inputs, hidden[:-1], hidden[-1])), nn.ReLU())
+        self.mu, self.log_sigma = nn.Linear(hidden[-1], latent), nn.Linear(hidden[-1], latent)
+
+    def forward(self, c: Tensor) -> tuple[Tensor, Tensor]:
+        """Readings (…, C) to μ and log σ, each (…, Z)."""
+        features = self.trunk(c)
+        return self.mu(features), self.log_sigma(features).clamp(*LOG_SIGMA_RANGE)
+
+
+def reparameterise(mu: Tensor, log_sigma: Tensor, epsilon: Tensor) -> Tensor:
+    """z = μ + σ ⊙ ε (paper, equation 2)."""
+    return mu + log_sigma.exp() * epsilon
+
+
+def gaussian_kl(mu: Tensor, log_sigma: Tensor) -> Tensor:
+    """KL[N(μ, σ²) ‖ N(0, I)], summed over the latent: (…, Z) → (…)."""
+    return 0.5 * (mu**2 + (2 * log_sigma).exp() - 1 - 2 * log_sigma).sum(-1)

@@ -1,0 +1,101 @@
+"""PC-BC: behaviour cloning conditioned on the reading itself (Ding et al., 2020; the paper's first baseline).
+
+The same inputs, data, network, loss and budget as RISE, without the encoder: a = π(s, g, c).
+"""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from rise_agents import cloning
+from rise_agents.agent import Progress, State, config_from_dict, silent
+from rise_agents.cloning import ActionUnits, CloningConfig, CloningData, Eyes
+from rise_agents.networks import mlp
+from rise_agents.readings import as_batch, is_batched
+from rise_agents.training import Forward, fit, to_arrays
+
+Config = CloningConfig
+
+
+class PCBC:
+    """Parameter-conditioned behaviour cloning.
+
+    Args:
+        env_id: a registered environment with a task description.
+        config: settings that differ from :class:`rise_agents.cloning.CloningConfig`.
+        seed: of the weights and the order of the data.
+        device: where it trains (it acts in NumPy).
+    """
+
+    name = "pcbc"
+    learns_from = "demonstrations"
+    evaluate_deterministic = True
+
+    def __init__(self, env_id: str, config: dict[str, Any], seed: int = 0, device: str = "cpu") -> None:
+        self.env_id, self.seed, self.device = env_id, seed, device
+        self.config: Config = config_from_dict(Config, config)
+        self.task, self.units = cloning.make_task(env_id), ActionUnits.of(env_id)
+        self._arrays: dict[str, NDArray] = {}
+
+    def learn(self, source: Any, progress: Progress = silent) -> PCBC:
+        """Clone :class:`rise_agents.demonstrations.Demonstrations`."""
+        demonstrations = cloning.check_source(source, self.env_id, self.name)
+        c = self.config
+        generator = cloning.seeded(self.seed, self.device)
+        eyes = Eyes.fit(self.task, c.frame, demonstrations)
+        data = cloning.prepare(demonstrations, eyes, self.units, c.transitions, self.device)
+        width = data.robot.shape[1] + data.reading.shape[1]
+        policy = mlp(width, c.hidden, cloning.output_size(data.action.shape[1], c.loss)).to(self.device)
+        fit(
+            policy.parameters(),
+            lambda rows: policy_loss(policy, data, rows, c.loss),
+            len(data.action),
+            updates=c.updates,
+            batch_size=c.batch_size,
+            learning_rate=c.learning_rate,
+            generator=generator,
+            progress=progress,
+        )
+        return self._use({**eyes.arrays(), **to_arrays(policy, "policy")})
+
+    def _use(self, arrays: dict[str, NDArray]) -> PCBC:
+        self._arrays = arrays
+        self._eyes = Eyes.from_arrays(self.task, self.config.frame, arrays)
+        self._policy = Forward(arrays, "policy")
+        return self
+
+    def predict(
+        self,
+        observation: dict[str, NDArray],
+        state: State = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray[np.float32], State]:
+        """Actions (B, A) for a batch of observations, or (A,) for one; the same whatever ``deterministic``."""
+        if not self._arrays:
+            raise cloning.untrained(self.name)
+        robot, reading = self._eyes(as_batch(observation))
+        output = self._policy(np.concatenate((robot, reading), -1))
+        action = self.units.to_action(output[:, : len(self.units.low)])
+        return (action if is_batched(observation) else action[0]), None
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Store the agent; :func:`rise_agents.load_agent` reads it."""
+        cloning.save(path, self, self._arrays)
+
+    @classmethod
+    def from_checkpoint(cls, arrays: dict[str, NDArray], description: dict[str, Any], device: str) -> PCBC:
+        """The agent that :meth:`save` stored."""
+        return cls(description["env"], description["config"], description["seed"], device)._use(arrays)
+
+
+def policy_loss(policy: Any, data: CloningData, rows: Tensor, kind: str) -> dict[str, Tensor]:
+    """The imitation loss of the transitions ``rows``."""
+    output = policy(torch.cat((data.robot[rows], data.reading[rows]), -1))
+    return {"loss": cloning.imitation_loss(output, data.action[rows], kind)}

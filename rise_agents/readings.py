@@ -1,0 +1,154 @@
+"""What a policy sees: observations in one of three frames, and their units.
+
+Every agent reads through this file, so that frames are compared on equal terms:
+
+``world``
+    state, goal and reading as the environment gives them (the paper).
+``body``
+    goal and readings relative to the robot: turned into the vehicle's heading frame, or relative to the hand.
+``features``
+    geometric quantities of the body frame (distances, clearance, closing speed, the angle an obstacle covers, its
+    offset from the straight way) that make the avoidance rule nearly linear.
+
+Shapes: B batch, R robot inputs, C reading inputs, N obstacles, D dimensions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rise_envs import streams
+from rise_envs.task import Task
+
+Array = NDArray[np.float64]
+FRAMES = ("world", "body", "features")
+
+
+def is_batched(observation: dict[str, Any]) -> bool:
+    """Whether the observation holds a batch (B, …) rather than a single one."""
+    return np.ndim(observation["desired_goal"]) == 2
+
+
+def as_batch(observation: dict[str, Any]) -> dict[str, Array]:
+    """The observation with a leading batch dimension, as float64."""
+    return {key: np.atleast_2d(np.asarray(value, np.float64)) for key, value in observation.items()}
+
+
+def inputs(task: Task, frame: str, observation: dict[str, Array]) -> tuple[Array, Array]:
+    """Robot inputs (B, R) and reading inputs (B, C) of a batched observation in the given frame."""
+    state, goal, reading = (observation[key] for key in ("observation", "desired_goal", "obstacle"))
+    if frame == "world":
+        return np.concatenate((state, goal), -1), reading
+    goal, position, velocity, radius = to_body(task, state, goal, reading)
+    robot = np.concatenate((state[:, list(task.body_state)], goal), -1)
+    if frame == "body":
+        c = np.concatenate((position, velocity, radius[..., None]), -1)
+        return robot, c.reshape(len(c), -1)
+    distance = np.linalg.norm(goal, axis=-1, keepdims=True)
+    way = goal / np.maximum(distance, 1e-6)
+    features = obstacle_features(task, way, distance, position, velocity, radius)
+    return np.concatenate((robot, distance, way), -1), features.reshape(len(goal), -1)
+
+
+def to_body(task: Task, state: Array, goal: Array, reading: Array) -> tuple[Array, Array, Array, Array]:
+    """Goal (B, D), positions and velocities (B, N, D) seen from the robot's frame, and radii (B, N).
+
+    Velocities keep their size (they are not relative to the robot's own), they are only turned.
+    """
+    origin, rotation = task.pose(state)
+    position, velocity, radius = task.split(reading)
+    # Rows times R is Rᵀ times columns: world to body.
+    goal = ((goal - origin)[:, None] @ rotation)[:, 0]
+    return goal, (position - origin[:, None]) @ rotation, velocity @ rotation, radius
+
+
+def to_world(task: Task, state: Array, position: Array, velocity: Array, radius: Array) -> Array:
+    """The inverse of :func:`to_body` for readings: (B, N, D) twice and (B, N) to (B, C)."""
+    origin, rotation = task.pose(state)
+    turned = rotation.swapaxes(-1, -2)
+    c = np.concatenate((position @ turned + origin[:, None], velocity @ turned, radius[..., None]), -1)
+    return c.reshape(len(c), -1)
+
+
+def obstacle_features(
+    task: Task, way: Array, goal_distance: Array, position: Array, velocity: Array, radius: Array
+) -> Array:
+    """Geometric features of obstacles in the body frame, (B, N, F).
+
+    Args:
+        task: gives the robot's radius.
+        way: unit vector towards the goal, (B, D).
+        goal_distance: (B, 1), m.
+        position: centres, (B, N, D), m.
+        velocity: (B, N, D), m/s.
+        radius: (B, N), m.
+    """
+    distance = np.linalg.norm(position, axis=-1, keepdims=True)
+    towards = position / np.maximum(distance, 1e-6)
+    reach = np.maximum(radius[..., None], 0.0) + task.robot_radius
+    closing = -(velocity * towards).sum(-1, keepdims=True)
+    across = velocity + closing * towards
+    covered = np.arcsin(np.clip(reach / np.maximum(distance, 1e-6), 0.0, 1.0))
+    along = (position * way[:, None]).sum(-1, keepdims=True)
+    aside = position - along * way[:, None]
+    offset = np.linalg.norm(aside, axis=-1, keepdims=True)
+    parts = [
+        *(position, velocity, radius[..., None], distance, towards, distance - reach, closing, across, covered),
+        *(along, along - goal_distance[:, None], aside, offset - reach, (towards * way[:, None]).sum(-1, keepdims=True)),
+    ]
+    if task.dim == 2:  # signed angles and offsets exist in the plane only
+        side = (way[:, None, 0] * position[..., 1] - way[:, None, 1] * position[..., 0])[..., None]
+        bearing = np.arctan2(position[..., 1], position[..., 0])[..., None]
+        parts += [side - reach, side + reach, bearing - covered, bearing + covered]
+    return np.concatenate(parts, -1)
+
+
+def reading_units(task: Task, frame: str, observation: dict[str, Array], draws: int = 8) -> Array:
+    """How much noise of level 1 moves each reading input, (C,): the units of the reading noise.
+
+    In the world and body frames this is the noise scale itself (noise is isotropic, and turning keeps it); for
+    features it is measured as the root mean square change over ``draws`` noisy copies of each observation.
+    """
+    scale = np.asarray(task.noise_scale)
+    if frame != "features":
+        return scale
+    clean = inputs(task, frame, observation)[1]
+    change = np.zeros(clean.shape[1])
+    keys = streams.split(np.arange(len(clean), dtype=np.uint64), 7)
+    for draw in range(draws):
+        counter = draw * len(scale) + np.arange(len(scale))
+        noise = streams.normal(keys[:, None], counter) * scale
+        noisy = inputs(task, frame, {**observation, "obstacle": observation["obstacle"] + noise})[1]
+        change += ((noisy - clean) ** 2).mean(0)
+    return np.sqrt(change / draws)
+
+
+@dataclass(frozen=True)
+class Standardiser:
+    """An affine change of units: (x − mean) / scale."""
+
+    mean: Array
+    scale: Array
+
+    @classmethod
+    def fit(cls, x: Array) -> Standardiser:
+        """Zero mean and unit variance on ``x`` (B, K); constant columns are only centred."""
+        std = x.std(0)
+        return cls(x.mean(0), np.where(std > 1e-8, std, 1.0))
+
+    def __call__(self, x: Array) -> NDArray[np.float32]:
+        """``x`` (B, K) in the new units, float32."""
+        return ((x - self.mean) / self.scale).astype(np.float32)
+
+    def arrays(self, name: str) -> dict[str, Array]:
+        """The numbers to store, under ``name``."""
+        return {f"{name}.mean": self.mean, f"{name}.scale": self.scale}
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, Array], name: str) -> Standardiser:
+        """The inverse of :meth:`arrays`."""
+        return cls(arrays[f"{name}.mean"], arrays[f"{name}.scale"])

@@ -1,0 +1,276 @@
+"""RISE: Robust Imitation through Stochastic Encoding (Tayal, Tayal and Prakash), Algorithm 1.
+
+Stage 1 trains a variational autoencoder on the readings c with the negative ELBO
+
+    L = −log p_ψ(c | z) + β KL[q_φ(z | c) ‖ N(0, I)],   z = μ + σ ⊙ ε,   ε ~ N(0, I),
+
+where p_ψ is a Gaussian whose deviation is the sensor's noise at level 1: reconstruction errors count in units
+of the reading noise. Stage 2 freezes it and clones the expert's action a with a policy π_θ(s, g, z),
+
+    L_π = 1/M Σ_m ℓ(π_θ(s, g, z⁽ᵐ⁾), a),   z⁽ᵐ⁾ = μ + σ ⊙ ε⁽ᵐ⁾,
+
+so that the policy meets M plausible readings for each one. At inference z is drawn from the posterior of the
+reading at hand.
+
+Shapes: B batch, M samples, C reading inputs, Z latent.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from rise_agents import cloning, readings
+from rise_agents.agent import Progress, State, config_from_dict, draw_state, fresh_state, require, silent
+from rise_agents.cloning import ActionUnits, CloningConfig, CloningData, Eyes
+from rise_agents.networks import LOG_SIGMA_RANGE, Encoder, gaussian_kl, mlp, reparameterise
+from rise_agents.training import Forward, fit, to_arrays
+from rise_envs import streams
+
+
+@dataclass(frozen=True)
+class Config(CloningConfig):
+    """Settings of RISE, beside those of every cloned policy.
+
+    Attributes:
+        latent: Z, size of the latent.
+        beta: weight of the KL term. Larger: more robust to noise, less exact on clean readings.
+        n_samples: M, posterior samples per transition in stage 2.
+        encoder_hidden: widths of the encoder's hidden layers; the decoder mirrors them.
+        vae_updates: gradient steps of stage 1.
+        vae_batch_size: readings per step of stage 1.
+        average: actions averaged over so many samples at inference (1: the paper's single draw).
+    """
+
+    latent: int = 5
+    beta: float = 0.05
+    n_samples: int = 8
+    encoder_hidden: tuple[int, ...] = (64, 64)
+    vae_updates: int = 10_000
+    vae_batch_size: int = 256
+    average: int = 1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(self.beta >= 0, "beta must not be negative", self.beta)
+        require(all(w >= 1 for w in self.encoder_hidden), "encoder_hidden must hold widths", self.encoder_hidden)
+        for name in ("latent", "n_samples", "vae_updates", "vae_batch_size", "average"):
+            require(getattr(self, name) >= 1, f"{name} must be at least 1", getattr(self, name))
+        require(len(self.encoder_hidden) >= 1, "encoder_hidden needs a layer", self.encoder_hidden)
+
+
+class VAE(nn.Module):
+    """Encoder and decoder of readings; the decoder answers in units of the reading noise."""
+
+    def __init__(self, inputs: int, config: Config) -> None:
+        super().__init__()
+        self.encoder = Encoder(inputs, config.encoder_hidden, config.latent)
+        self.decoder = mlp(config.latent, config.encoder_hidden[::-1], inputs)
+
+    def loss(self, c: Tensor, target: Tensor, epsilon: Tensor, beta: float) -> dict[str, Tensor]:
+        """Negative ELBO (Algorithm 1, line 7).
+
+        Args:
+            c: readings in standard units, (B, C).
+            target: the same readings in units of the reading noise, (B, C).
+            epsilon: standard normal draws, (B, Z).
+            beta: weight of the KL term.
+        """
+        mu, log_sigma = self.encoder(c)
+        decoded = self.decoder(reparameterise(mu, log_sigma, epsilon))
+        reconstruction = 0.5 * ((decoded - target) ** 2).sum(-1).mean()
+        kl = gaussian_kl(mu, log_sigma).mean()
+        return {"loss": reconstruction + beta * kl, "reconstruction": reconstruction, "kl": kl}
+
+
+def policy_loss(
+    policy: nn.Module, robot: Tensor, mu: Tensor, log_sigma: Tensor, action: Tensor, epsilon: Tensor, kind: str
+) -> dict[str, Tensor]:
+    """The loss of stage 2, averaged over M posterior samples (Algorithm 1, lines 14 to 19).
+
+    Args:
+        policy: π_θ on (s, g, z).
+        robot: (B, R).
+        mu: (B, Z), without gradient.
+        log_sigma: (B, Z), without gradient.
+        action: (B, A).
+        epsilon: standard normal draws, (M, B, Z).
+        kind: the imitation loss.
+    """
+    z = reparameterise(mu, log_sigma, epsilon)
+    output = policy(torch.cat((robot.expand(len(epsilon), *robot.shape), z), -1))
+    return {"loss": cloning.imitation_loss(output, action, kind)}
+
+
+class Rise:
+    """The paper's agent.
+
+    Args:
+        env_id: a registered environment with a task description.
+        config: settings that differ from :class:`Config`.
+        seed: of the weights, the order of the data and the samples.
+        device: where it trains (it acts in NumPy).
+    """
+
+    name = "rise"
+    learns_from = "demonstrations"
+    evaluate_deterministic = False  # the paper draws z from the posterior at inference
+
+    def __init__(self, env_id: str, config: dict[str, Any], seed: int = 0, device: str = "cpu") -> None:
+        self.env_id, self.seed, self.device = env_id, seed, device
+        self.config: Config = config_from_dict(Config, config)
+        self.task, self.units = cloning.make_task(env_id), ActionUnits.of(env_id)
+        self._rng = np.random.default_rng(seed)
+        self._arrays: dict[str, NDArray] = {}
+
+    def learn(self, source: Any, progress: Progress = silent) -> Rise:
+        """Algorithm 1 on :class:`rise_agents.demonstrations.Demonstrations`."""
+        demonstrations = cloning.check_source(source, self.env_id, self.name)
+        c = self.config
+        generator = cloning.seeded(self.seed, self.device)
+        eyes = Eyes.fit(self.task, c.frame, demonstrations)
+        data = cloning.prepare(demonstrations, eyes, self.units, c.transitions, self.device)
+        # Standard units → units of the reading noise: what the decoder answers in.
+        sample = demonstrations.subsample(20_000)
+        noise = readings.reading_units(self.task, c.frame, sample)
+        ratio = torch.from_numpy((eyes.reading.scale / np.maximum(noise, 1e-9)).astype(np.float32)).to(self.device)
+        share = c.vae_updates / (c.vae_updates + c.updates)
+
+        vae = VAE(data.reading.shape[1], c).to(self.device)
+        self._fit_vae(vae, data, ratio, generator, lambda done, figures: progress(share * done, figures))
+        with torch.no_grad():
+            mu, log_sigma = vae.encoder(data.reading)
+        # Stage 2 sees the latent with unit scale, which only renames its axes.
+        spread = mu.std(0).clamp_min(1e-6)
+        width = data.robot.shape[1] + c.latent
+        policy = mlp(width, c.hidden, cloning.output_size(data.action.shape[1], c.loss)).to(self.device)
+        self._fit_policy(
+            policy,
+            data,
+            (mu / spread, log_sigma - spread.log()),
+            generator,
+            lambda done, figures: progress(share + (1 - share) * done, figures),
+        )
+        weights = {**to_arrays(vae, "vae"), **to_arrays(policy, "policy")}
+        scale = {"vae.spread": spread.cpu().numpy(), "vae.ratio": ratio.cpu().numpy()}
+        return self._use({**eyes.arrays(), **weights, **scale})
+
+    def _fit_vae(
+        self, vae: VAE, data: CloningData, ratio: Tensor, generator: torch.Generator, progress: Progress
+    ) -> None:
+        c = self.config
+
+        def loss(rows: Tensor) -> dict[str, Tensor]:
+            reading = data.reading[rows]
+            epsilon = torch.randn((len(rows), c.latent), generator=generator, device=generator.device)
+            return vae.loss(reading, reading * ratio, epsilon, c.beta)
+
+        fit(
+            vae.parameters(),
+            loss,
+            len(data.reading),
+            updates=c.vae_updates,
+            batch_size=c.vae_batch_size,
+            learning_rate=c.learning_rate,
+            generator=generator,
+            progress=progress,
+        )
+
+    def _fit_policy(
+        self,
+        policy: nn.Module,
+        data: CloningData,
+        posterior: tuple[Tensor, Tensor],
+        generator: torch.Generator,
+        progress: Progress,
+    ) -> None:
+        c, (mu, log_sigma) = self.config, posterior
+
+        def loss(rows: Tensor) -> dict[str, Tensor]:
+            shape = (c.n_samples, len(rows), c.latent)
+            epsilon = torch.randn(shape, generator=generator, device=generator.device)
+            return policy_loss(
+                policy, data.robot[rows], mu[rows], log_sigma[rows], data.action[rows], epsilon, c.loss
+            )
+
+        fit(
+            policy.parameters(),
+            loss,
+            len(data.action),
+            updates=c.updates,
+            batch_size=c.batch_size,
+            learning_rate=c.learning_rate,
+            generator=generator,
+            progress=progress,
+        )
+
+    def _use(self, arrays: dict[str, NDArray]) -> Rise:
+        self._arrays = arrays
+        self._eyes = Eyes.from_arrays(self.task, self.config.frame, arrays)
+        self._trunk = Forward(arrays, "vae.encoder.trunk")
+        self._heads = [(arrays[f"vae.encoder.{h}.weight"].T, arrays[f"vae.encoder.{h}.bias"]) for h in ("mu", "log_sigma")]
+        self._policy = Forward(arrays, "policy")
+        return self
+
+    def encode(self, reading: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """The posterior of readings in standard units (B, C): μ and σ, each (B, Z), in the policy's units."""
+        features = np.maximum(self._trunk(reading), 0.0)
+        mu, log_sigma = (features @ weight + bias for weight, bias in self._heads)
+        spread = self._arrays["vae.spread"]
+        return mu / spread, np.exp(np.clip(log_sigma, *LOG_SIGMA_RANGE)) / spread
+
+    def initial_state(self, keys: NDArray[np.uint64]) -> State:
+        """Streams of posterior samples for episodes with the given keys (B,)."""
+        return fresh_state(keys)
+
+    def predict(
+        self,
+        observation: dict[str, NDArray],
+        state: State = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray[np.float32], State]:
+        """Actions (B, A) for a batch of observations, or (A,) for one.
+
+        Args:
+            observation: with the keys of the environment.
+            state: what the last call returned.
+            episode_start: (B,), rows whose stream of samples starts anew.
+            deterministic: act on the posterior mean instead of a sample.
+        """
+        if not self._arrays:
+            raise cloning.untrained(self.name)
+        robot, reading = self._eyes(readings.as_batch(observation))
+        mu, sigma = self.encode(reading)
+        if deterministic:
+            unit = self._act(robot, mu)
+        else:
+            keys, counter = draw_state(state, episode_start, len(mu), self._rng)
+            draws = counter[:, None] * np.uint64(self.config.average * mu.shape[1])
+            unit = np.zeros((len(mu), len(self.units.low)), np.float32)
+            for k in range(self.config.average):
+                epsilon = streams.normal(keys[:, None], draws + np.arange(mu.shape[1]) + k * mu.shape[1])
+                unit += self._act(robot, (mu + sigma * epsilon).astype(np.float32)) / self.config.average
+            state = (keys, counter + np.uint64(1))
+        action = self.units.to_action(unit)
+        return (action if readings.is_batched(observation) else action[0]), state
+
+    def _act(self, robot: NDArray[np.float32], z: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Clipped unit actions of π(s, g, z)."""
+        output = self._policy(np.concatenate((robot, z), -1))
+        return np.clip(output[:, : len(self.units.low)], -1.0, 1.0)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Store the agent; :func:`rise_agents.load_agent` reads it."""
+        cloning.save(path, self, self._arrays)
+
+    @classmethod
+    def from_checkpoint(cls, arrays: dict[str, NDArray], description: dict[str, Any], device: str) -> Rise:
+        """The agent that :meth:`save` stored."""
+        return cls(description["env"], description["config"], description["seed"], device)._use(arrays)
