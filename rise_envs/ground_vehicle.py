@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from typing import Any
 
 import gymnasium as gym
@@ -10,147 +9,12 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from rise_envs import geometry, goals, obstacles, streams
+from rise_envs import goals, streams
 from rise_envs.actions import checked_action
-from rise_envs.obstacles import Motion
 from rise_envs.task import Task
+from rise_envs.vehicle_world import Array, Params, World, advance, observe, sample_starts, start_clearance
 
-Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Params:
-    """Every constant of the task, in SI units."""
-
-    dt: float = 0.1
-    v_min: float = 0.0
-    v_max: float = 2.5
-    omega_max: float = 1.5
-    robot_radius: float = 0.5
-    goal_radius: float = 0.75
-    arena_half: float = 10.0  # start and goal lie in the square [−arena_half, arena_half]²
-    goal_distance: tuple[float, float] = (12.5, 20.0)
-    heading_spread: float = np.pi / 3  # start heading off the goal's direction, at most
-    obstacle_radius: tuple[float, float] = (0.75, 2.0)
-    obstacle_speed: float = 1.0
-    redraw_interval: float = 2.0  # mean time between two draws of a disc's velocity
-    obstacle_along: tuple[float, float] = (0.35, 0.75)  # share of the way from start to goal
-    obstacle_offset: float = 2.5  # to either side of the straight way, at most
-    obstacle_half: float = 12.0  # centres stay in the square [−obstacle_half, obstacle_half]²
-    goal_gap: float = 1.5  # discs keep this far off the goal point: the whole goal region stays free
-    start_margin: float = 1.0  # least clearance over the discs' path in the first start_horizon seconds
-    start_horizon: float = 1.0
-
-    @property
-    def motion(self) -> Motion:
-        """How the discs move."""
-        box = (self.obstacle_half, self.obstacle_half)
-        low = (-self.obstacle_half, -self.obstacle_half)
-        return Motion(self.dt, self.obstacle_speed, self.redraw_interval, low, box, self.goal_gap)
-
-
-@dataclass
-class World:
-    """The true state of B episodes: vehicle, goal and N discs. Arrays are replaced, never written into."""
-
-    state: Array  # (B, 3)
-    goal: Array  # (B, 2)
-    position: Array  # (B, N, 2)
-    velocity: Array  # (B, N, 2), in the coming step
-    radius: Array  # (B, N)
-    key: NDArray[np.uint64]  # (B,)
-    step: NDArray[np.int64]  # (B,)
-
-    def merge(self, other: World, rows: NDArray[np.bool_]) -> World:
-        """This world with the given ``rows`` (B,) bool taken from ``other``, which holds only those."""
-        merged = {name: array.copy() for name, array in vars(self).items()}
-        for name, array in merged.items():
-            array[rows] = getattr(other, name)
-        return World(**merged)
-
-
-def _propose(keys: NDArray[np.uint64], attempt: int, n: int, p: Params) -> tuple[World, NDArray[np.bool_]]:
-    """One candidate start per key (B,), and which candidates are valid."""
-    size = 5 + 3 * n
-    u = streams.uniform(keys[:, None], attempt * size + np.arange(size))
-
-    def draw(column: Any, low: float, high: float) -> Array:
-        return low + (high - low) * u[:, column]
-
-    start = draw([0, 1], -p.arena_half, p.arena_half)
-    course, distance = draw(2, -np.pi, np.pi), draw(3, *p.goal_distance)
-    ahead = np.stack((np.cos(course), np.sin(course)), -1)
-    goal = start + distance[:, None] * ahead
-    heading = geometry.wrap_angle(course + draw(4, -p.heading_spread, p.heading_spread))
-
-    along = draw(slice(5, 5 + n), *p.obstacle_along) * distance[:, None]
-    aside = draw(slice(5 + n, 5 + 2 * n), -p.obstacle_offset, p.obstacle_offset)
-    radius = draw(slice(5 + 2 * n, 5 + 3 * n), *p.obstacle_radius)
-    left = np.stack((-ahead[:, 1], ahead[:, 0]), -1)
-    position = start[:, None] + along[..., None] * ahead[:, None] + aside[..., None] * left[:, None]
-    velocity = obstacles.draw_velocity(streams.split(keys, 2), attempt, n, p.motion)
-
-    offset = position - start[:, None]
-    swept = geometry.segment_distance(offset, offset + p.start_horizon * velocity) - radius - p.robot_radius
-    valid = (np.abs(goal) <= p.arena_half).all(-1)
-    valid &= (swept >= p.start_margin).all(-1)
-    valid &= (np.abs(position) <= p.obstacle_half).all((-1, -2))
-    valid &= (np.linalg.norm(position - goal[:, None], axis=-1) >= radius + p.goal_gap).all(-1)
-    velocity = obstacles.keep_inside(position, velocity, radius, goal, p.motion)
-    state = np.concatenate((start, heading[:, None]), -1)
-    return World(state, goal, position, velocity, radius, keys, np.zeros(len(keys), np.int64)), valid
-
-
-def sample_starts(keys: NDArray[np.uint64], n_obstacles: int, params: Params) -> World:
-    """Fair starts, one for each episode key (B,), each a pure function of its key."""
-    draws = streams.split(keys, 0)
-    world, valid = _propose(draws, 0, n_obstacles, params)
-    attempt = 0
-    while not valid.all():
-        attempt += 1
-        missing = ~valid
-        candidate, good = _propose(draws[missing], attempt, n_obstacles, params)
-        world = world.merge(candidate, missing)
-        valid[missing] = good
-    return replace(world, key=keys)
-
-
-def advance(world: World, action: Array, params: Params) -> tuple[World, Array]:
-    """One step of the task's dynamics.
-
-    Args:
-        world: B episodes.
-        action: (v, ω) inside the bounds, (B, 2).
-        params: constants of the task.
-
-    Returns:
-        The world after the step, and the least clearance (m) over the step and all discs, (B,).
-    """
-    clearance = geometry.swept_clearance(
-        world.state, action, world.position, world.velocity, world.radius, params.dt, params.robot_radius
-    )
-    position, step = world.position + params.dt * world.velocity, world.step + 1
-    velocity = obstacles.redraw(world.velocity, streams.split(world.key, 1), step, params.motion)
-    velocity = obstacles.keep_inside(position, velocity, world.radius, world.goal, params.motion)
-    state = geometry.unicycle(world.state, action, params.dt)
-    moved = World(state, world.goal, position, velocity, world.radius, world.key, step)
-    return moved, clearance.min(-1)
-
-
-def start_clearance(world: World, params: Params) -> Array:
-    """Clearance (B,) at an instant, in m."""
-    distance = np.linalg.norm(world.position - world.state[:, None, :2], axis=-1)
-    return (distance - world.radius - params.robot_radius).min(-1)
-
-
-def observe(world: World) -> dict[str, Array]:
-    """The true observation of B episodes (every array is the caller's own)."""
-    return {
-        "observation": world.state.copy(),
-        "achieved_goal": world.state[:, :2].copy(),
-        "desired_goal": world.goal.copy(),
-        "obstacle": obstacles.readings(world.position, world.velocity, world.radius),
-    }
+DEFAULTS = Params()
 
 
 def _pose(state: Array) -> tuple[Array, Array]:
@@ -159,7 +23,8 @@ def _pose(state: Array) -> tuple[Array, Array]:
 
 
 def make_spaces(n_obstacles: int, p: Params) -> tuple[spaces.Dict, spaces.Box]:
-    reach = p.arena_half + 200 * p.dt * p.v_max  # nobody drives further in an episode
+    """Observation and action space of one vehicle among ``n_obstacles`` discs."""
+    reach = p.arena_half + 200 * p.dt * max(p.v_max, -p.v_min)  # nobody drives further in an episode
     disc_high = [p.obstacle_half] * 2 + [p.obstacle_speed] * 2 + [p.obstacle_radius[1]]
     disc_low = [-p.obstacle_half] * 2 + [-p.obstacle_speed] * 2 + [p.obstacle_radius[0]]
 
@@ -172,12 +37,14 @@ def make_spaces(n_obstacles: int, p: Params) -> tuple[spaces.Dict, spaces.Box]:
         desired_goal=box([-p.arena_half] * 2, [p.arena_half] * 2),
         obstacle=box(disc_low * n_obstacles, disc_high * n_obstacles),
     )
-    low, high = np.float32([p.v_min, -p.omega_max]), np.float32([p.v_max, p.omega_max])
-    return observation, spaces.Box(low, high, dtype=np.float32)
+    low, high = [p.v_min, -p.omega_max], [p.v_max, p.omega_max]
+    return observation, spaces.Box(np.array(low, np.float32), np.array(high, np.float32), dtype=np.float32)
 
 
 class VehicleTask:
-    """What the single and the batched environment share: arguments, spaces, goal API, description."""
+    """What the single and the batched environment share: arguments, state, goal API, description."""
+
+    _world: World | None = None
 
     def __init__(
         self, reward_type: str, terminate_on_collision: bool, n_obstacles: int, params: Params
@@ -188,13 +55,24 @@ class VehicleTask:
         self.terminate_on_collision = bool(terminate_on_collision)
         self.n_obstacles, self.params = int(n_obstacles), params
 
+    @property
+    def world(self) -> World:
+        """The true state, for drawing and tests: to be read, never to be written into.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the first reset.
+        """
+        if self._world is None:
+            raise gym.error.ResetNeeded("call reset() to start an episode")
+        return self._world
+
     @staticmethod
     def task(n_obstacles: int = 1, params: Params | None = None, **_: Any) -> Task:
         """The meaning of the numbers, for agents (see :class:`rise_envs.task.Task`).
 
         The reading noise at level 1 is the paper's N(0, 1) on every channel, in SI units.
         """
-        p = params or Params()
+        p = params or DEFAULTS
         scale = (1.0,) * (5 * n_obstacles)
         return Task(2, n_obstacles, scale, p.robot_radius, p.goal_radius, p.dt, p.v_max, _pose, ())
 
@@ -227,7 +105,8 @@ class GroundVehicleEnv(VehicleTask, gym.Env):
     average, it turns at the arena's walls, and it keeps off the goal. The paper's first task.
 
     ## Action space
-    `Box(2,)`, float32; values outside are clipped, non-finite ones raise `ValueError`.
+    `Box(2,)`, float32, in SI units; values outside are clipped, non-finite ones raise `ValueError`.
+    For algorithms that want [−1, 1], wrap in `RescaleAction(env, np.float32(-1), np.float32(1))`.
 
     | index | action | unit | bounds |
     |---|---|---|---|
@@ -242,9 +121,9 @@ class GroundVehicleEnv(VehicleTask, gym.Env):
     | `observation` | state s = (x, y, θ) | m, rad | ±60, ±π |
     | `achieved_goal` | (x, y) | m | ±60 |
     | `desired_goal` | goal g = (gx, gy) | m | ±10 |
-    | `obstacle` | per disc the reading c = (px, py, vx, vy, r), true here: wrap for noise | m, m/s, m | ±12, ±1, [0.75, 2] |
+    | `obstacle` | per disc the reading c = (px, py, vx, vy, r) | m, m/s, m | ±12, ±1, [0.75, 2] |
 
-    The velocity in the reading is that of the coming step.
+    The reading is the true one (wrap the environment for noise); its velocity is that of the coming step.
 
     ## Reward
     `dense` (default): progress towards the goal in units of the goal radius, plus 1 on reaching it.
@@ -255,16 +134,18 @@ class GroundVehicleEnv(VehicleTask, gym.Env):
     distance within the step (m) · `is_success` · `previous_achieved_goal` where the step began.
 
     ## Start
-    Start and goal uniform in a 20 m square, 12.5 to 20 m apart; heading within 60° of the goal's direction; disc of
-    radius 0.75 to 2 m at 35–75 % of the way, at most 2.5 m off it, at least 1 m clear of the vehicle over its
-    path of the first second. `reset(seed=…)` replays an episode bit for bit.
+    Start uniform in a square of 20 m; goal in any direction, 12.5 to 20 m away, inside the square too (draws
+    that are not are drawn anew); heading within 60° of the goal's direction; disc of radius 0.75 to 2 m at
+    35–75 % of the way, at most 2.5 m off it, at least 1 m clear of the vehicle over its path of the first
+    second. `reset(seed=…)` replays an episode bit for bit.
 
     ## End
     Terminates within 0.75 m of the goal (and on collision with `terminate_on_collision=True`); truncated
     after 200 steps.
 
     ## Arguments
-    `render_mode` (`"rgb_array"` or `"human"`), `reward_type`, `terminate_on_collision`, `n_obstacles`, `params`.
+    `render_mode` (`"rgb_array"` or `"human"`), `reward_type`, `terminate_on_collision`, `n_obstacles`,
+    `params` (:class:`rise_envs.vehicle_world.Params`: every constant of the task).
 
     ## Versions
     v0: first.
@@ -273,6 +154,7 @@ class GroundVehicleEnv(VehicleTask, gym.Env):
     Tayal, Tayal and Prakash, "RISE: Robust Imitation through Stochastic Encoding", section IV-B.
     """
 
+    action_space: spaces.Box
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 10}  # noqa: RUF012
 
     def __init__(
@@ -281,7 +163,7 @@ class GroundVehicleEnv(VehicleTask, gym.Env):
         reward_type: str = "dense",
         terminate_on_collision: bool = False,
         n_obstacles: int = 1,
-        params: Params = Params(),
+        params: Params = DEFAULTS,
     ) -> None:
         super().__init__(reward_type, terminate_on_collision, n_obstacles, params)
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
@@ -289,7 +171,6 @@ class GroundVehicleEnv(VehicleTask, gym.Env):
         self.render_mode = render_mode
         self.observation_space, self.action_space = make_spaces(self.n_obstacles, params)
         self.perceived: Array | None = None  # the reading as a noise wrapper last handed it out
-        self._world: World | None = None
         self._trail: list[Array] = []
         self._window: Any = None
 
@@ -300,11 +181,11 @@ class GroundVehicleEnv(VehicleTask, gym.Env):
         super().reset(seed=seed)
         keys = np.array([streams.draw_key(self.np_random)])
         self._world, self.perceived = sample_starts(keys, self.n_obstacles, self.params), None
-        self._trail = [self._world.state[0, :2]]
-        info = self._info(start_clearance(self._world, self.params)[0], self._world.state[0, :2])
+        self._trail = [self.world.state[0, :2]]
+        info = self._info(start_clearance(self.world, self.params)[0], self.world.state[0, :2])
         if self.render_mode == "human":
             self.render()
-        return self._observe(), {**info, "cost": 0.0}
+        return self._observe(), info
 
     def step(self, action: Any) -> tuple[dict[str, Array], float, bool, bool, dict[str, Any]]:
         """Drive for one step.
@@ -313,12 +194,10 @@ class GroundVehicleEnv(VehicleTask, gym.Env):
             ValueError: an action of the wrong shape, or not finite. Nothing has moved then.
             gymnasium.error.ResetNeeded: before the first reset.
         """
-        if self._world is None:
-            raise gym.error.ResetNeeded("call reset() before step()")
-        before = self._world.state[0, :2]
+        before = self.world.state[0, :2]
         driven = checked_action(action, self.action_space)
-        self._world, clearance = advance(self._world, driven[None], self.params)
-        self._trail.append(self._world.state[0, :2])
+        self._world, clearance = advance(self.world, driven[None], self.params)
+        self._trail.append(self.world.state[0, :2])
         observation, info = self._observe(), self._info(clearance[0], before)
         achieved, goal = observation["achieved_goal"], observation["desired_goal"]
         reward = float(self.compute_reward(achieved, goal, info))
@@ -328,14 +207,14 @@ class GroundVehicleEnv(VehicleTask, gym.Env):
         return observation, reward, terminated, False, info
 
     def _observe(self) -> dict[str, Array]:
-        return {key: rows[0] for key, rows in observe(self._world).items()}
+        return {key: rows[0] for key, rows in observe(self.world).items()}
 
     def _info(self, clearance: float, before: Array) -> dict[str, Any]:
-        world = self._world
+        achieved, goal = self.world.state[0, :2], self.world.goal[0]
         return {
             "cost": float(clearance < 0),
             "clearance": float(clearance),
-            "is_success": bool(goals.distance(world.state[0, :2], world.goal[0]) <= self.params.goal_radius),
+            "is_success": bool(goals.distance(achieved, goal) <= self.params.goal_radius),
             "previous_achieved_goal": before.copy(),
         }
 
@@ -348,7 +227,7 @@ class GroundVehicleEnv(VehicleTask, gym.Env):
             return None
         from rise_envs import rendering  # pygame is loaded by those who draw only
 
-        w = self._world
+        w = self.world
         frame = rendering.draw_vehicle_scene(
             w.state[0],
             w.goal[0],

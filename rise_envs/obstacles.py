@@ -26,7 +26,8 @@ class Motion:
     Attributes:
         dt: duration of a control step (s).
         max_speed: speeds are drawn from U[0, max_speed] (m/s), directions uniformly.
-        redraw_interval: mean time between two draws of a ball's velocity (s), exponentially distributed.
+        redraw_interval: mean time between two draws of a ball's velocity (s): at every step a coin, so that
+            the draws have no memory and nobody can foresee them.
         low: lower corner of the box that the centres stay in (m), length D.
         high: upper corner of that box (m), length D.
         goal_gap: least distance kept between a ball's surface and the goal point (m).
@@ -41,7 +42,7 @@ class Motion:
 
 
 def draw_velocity(key: NDArray[np.uint64], counter: NDArray | int, n: int, motion: Motion) -> Array:
-    """Velocities (B, N, D), isotropic in direction, for keys (B,) at draw number ``counter`` (int or (B,))."""
+    """Velocities (B, N, D), isotropic in direction: draw number ``counter`` (int or (B,)) of keys (B,)."""
     d = len(motion.low)
     index = np.arange(n * (d + 1), dtype=np.uint64).reshape(n, d + 1)
     start = np.reshape(np.asarray(counter, dtype=np.uint64), (-1, 1, 1)) * np.uint64(2 * n * (d + 1))
@@ -57,9 +58,7 @@ def redraw(velocity: Array, key: NDArray[np.uint64], step: NDArray | int, motion
     counter = np.reshape(np.asarray(step, dtype=np.uint64), (-1, 1)) * np.uint64(n) + np.arange(
         n, dtype=np.uint64
     )
-    due = streams.uniform(np.reshape(coins, (-1, 1)), counter) < -np.expm1(
-        -motion.dt / motion.redraw_interval
-    )
+    due = streams.uniform(np.reshape(coins, (-1, 1)), counter) < motion.dt / motion.redraw_interval
     if not due.any():
         return velocity
     rows = due.any(axis=1)
@@ -81,7 +80,7 @@ def keep_inside(position: Array, velocity: Array, radius: Array, goal: Array, mo
 
     Returns:
         The velocity, mirrored at the walls of the box and at the ball of radius ``radius + goal_gap`` around
-        the goal. A ball that would still break a bound (a corner between both) rests for this step.
+        the goal. A ball that would still break a bound (a corner between both) rests until its next draw.
     """
     low, high = np.asarray(motion.low), np.asarray(motion.high)
     ahead = position + motion.dt * velocity
