@@ -1,0 +1,77 @@
+"""Names and numbers as people read them; shared by tables, figures and pages."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from benchmarks.results import SummaryRow
+
+REFERENCES = ("expert", "random")  # rows to compare with, not agents under test
+_AGENTS = {"rise": "RISE", "pcbc": "PC-BC", "cppo": "C-PPO", "expert": "Expert", "random": "Random"}
+_ENVS = {"RISE-SafePanda-v0": "Franka Panda"}  # others are read off their id
+_NOISE = {
+    "step": "fresh noise at every step",
+    "episode": "one constant error per episode",
+    "drift": "a drifting error",
+    "dropout": "lost readings",
+    "delay": "delayed readings",
+    "quantise": "rounded readings",
+}
+
+
+def agent_label(name: str) -> str:
+    """The usual spelling of an agent's name; unknown names stay as they are."""
+    return _AGENTS.get(name, name)
+
+
+def env_label(env: str) -> str:
+    """A task in plain words: ``RISE-GroundVehicle-v0`` is "Ground vehicle"; foreign ids keep theirs."""
+    match = re.fullmatch(r"RISE-(\w+)-v\d+", env)
+    if env in _ENVS or match is None:
+        return _ENVS.get(env, env)
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", " ", match[1]).capitalize()
+
+
+def noise_label(model: str) -> str:
+    """A noise model (``rise_envs.noise``) in a few words: ``step+delay:2`` is "… + delayed readings (2)"."""
+    parts = [part.partition(":") for part in model.split("+")]
+    return " + ".join(_NOISE.get(name, name) + f" ({value})" * bool(value) for name, _, value in parts)
+
+
+def condition_label(model: str, level: float) -> str:
+    """A noise model at a level, in words."""
+    return f"noise level {level:g} ({noise_label(model) if level else 'clean readings'})"
+
+
+def percent(rate: float) -> str:
+    """A rate in [0, 1] as a percentage without its sign: one decimal, or two where one would lie.
+
+    Only a true 1 reads "100.0" and only a true 0 reads "0.0": one collision in 5,000 must stay visible.
+    """
+    text = f"{100 * rate:.1f}"
+    if text in ("0.0", "100.0") and rate not in (0.0, 1.0):
+        return f"{min(max(100 * rate, 0.01), 99.99):.2f}"
+    return text
+
+
+def interval(low: float, high: float) -> str:
+    """An interval of rates, in per cent: ``83.6–87.9``."""
+    return f"{percent(low)}–{percent(high)}"
+
+
+def count(values: Iterable[int], noun: str) -> str:
+    """How many of something there are in every row: "1,000 episodes", "1 episode", "500–1,000 episodes"."""
+    counts = sorted(set(values))
+    text = "–".join(f"{n:,}" for n in dict.fromkeys((counts[0], counts[-1])))
+    return f"{text} {noun}" if counts[-1] == 1 else f"{text} {noun}s"
+
+
+def sample(rows: Sequence[SummaryRow], mark: str) -> str:
+    """How much evidence a ``mark`` stands for: "5,000 episodes per bar of 5 training seeds"."""
+    # Reference rows are not trained: they say nothing about training seeds.
+    seeds = {row.train_seeds for row in rows if row.agent not in REFERENCES} or {1}
+    trained = "" if seeds == {1} else f" of {count(seeds, 'training seed')}"
+    return f"{count([row.episodes for row in rows], 'episode')} per {mark}{trained}"

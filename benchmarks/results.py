@@ -1,0 +1,259 @@
+"""One row per episode: the only reader and writer of result files.
+
+Parquet files are byte-reproducible (the same rows give the same bytes), carry a checksum per page, and appear
+whole or not at all.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import itertools
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from benchmarks import stats
+from rise_agents.checkpoint import replace_file
+
+StrPath = str | os.PathLike[str]
+
+SCHEMA = pa.schema(
+    [
+        pa.field(name, kind, nullable=False)
+        for name, kind in {
+            "env": pa.string(),
+            "agent": pa.string(),
+            "train_seed": pa.int64(),
+            "noise_model": pa.string(),
+            "noise_level": pa.float64(),
+            "scenario": pa.int64(),  # number of the scenario within the protocol
+            "env_seed": pa.int64(),
+            "noise_seed": pa.int64(),
+            "safe": pa.bool_(),  # no step had a collision
+            "arrived": pa.bool_(),  # the goal was reached, collisions ignored
+            "reached": pa.bool_(),  # arrived and safe
+            "steps": pa.int64(),
+            "episode_cost": pa.float64(),
+            "min_clearance": pa.float64(),  # m, negative in collision
+            "episode_return": pa.float64(),
+        }.items()
+    ]
+)
+KEY = ("env", "agent", "train_seed", "noise_model", "noise_level", "scenario")
+_GROUP = ("env", "agent", "noise_model", "noise_level")
+
+
+def from_columns(columns: Mapping[str, Any]) -> pa.Table:
+    """Rows from arrays, one per column of ``SCHEMA``, each (T,) or one value for all rows.
+
+    Raises:
+        ValueError: missing, unknown, uneven or mistyped columns, or contradictory rows.
+    """
+    n = max((len(value) for value in columns.values() if np.ndim(value)), default=1)
+    arrays = {}
+    for name, value in columns.items():
+        filled = np.full(n, value) if np.ndim(value) == 0 else np.asarray(value)
+        try:
+            kind = SCHEMA.field(name).type if name in SCHEMA.names else None
+            arrays[name] = pa.array(filled, type=kind)
+        except (pa.ArrowException, OverflowError) as error:
+            raise ValueError(f"new rows: column {name!r}: {error}") from None
+    lengths = {name: len(array) for name, array in arrays.items()}
+    if len(set(lengths.values())) > 1:
+        raise ValueError(f"new rows: columns of different lengths: {lengths}")
+    return check(pa.table(arrays), "new rows")
+
+
+def check(table: pa.Table, where: str) -> pa.Table:
+    """``table`` with exactly the columns of ``SCHEMA``, in that order.
+
+    Raises:
+        ValueError: names ``where`` and the first offending column.
+    """
+    for name in SCHEMA.names:
+        if table.column_names.count(name) != 1:
+            raise ValueError(f"{where}: column {name!r} is missing or doubled")
+    for name in table.column_names:
+        if name not in SCHEMA.names:
+            raise ValueError(f"{where}: unknown column {name!r}; the columns are {', '.join(SCHEMA.names)}")
+    for field in SCHEMA:
+        column = table[field.name]
+        if column.type != field.type:
+            raise ValueError(f"{where}: column {field.name!r} is {column.type}, must be {field.type}")
+        if column.null_count:
+            raise ValueError(f"{where}: column {field.name!r} has {column.null_count} empty entries")
+    table = pa.table([table[name] for name in SCHEMA.names], schema=SCHEMA)
+    level = table["noise_level"].to_numpy()
+    if not np.all(np.isfinite(level) & (level >= 0)):
+        raise ValueError(f"{where}: column 'noise_level' must be finite and not negative")
+    safe, arrived, reached = (table[name].to_numpy() for name in ("safe", "arrived", "reached"))
+    if not np.array_equal(reached, safe & arrived):
+        raise ValueError(f"{where}: column 'reached' contradicts 'safe' and 'arrived'")
+    return table
+
+
+def atomic_write_bytes(path: StrPath, content: bytes) -> None:
+    """Write a file so that a reader, or the next run after a crash, finds the old content or the new."""
+    replace_file(path, content)
+
+
+def atomic_write_text(path: StrPath, content: str) -> None:
+    """As :func:`atomic_write_bytes`, UTF-8, line ends as given."""
+    atomic_write_bytes(path, content.encode())
+
+
+def write_rows(path: StrPath, table: pa.Table) -> None:
+    """Write rows, in the order given, as Parquet; the same rows give the same bytes.
+
+    Raises:
+        ValueError: rows that do not follow ``SCHEMA``.
+        OSError: the file cannot be written; an earlier one is intact.
+    """
+    rows = check(table, str(path)).combine_chunks()
+    sink = io.BytesIO()
+    # No Arrow schema inside: the Parquet types say it all, and its encoding may change with the version.
+    pq.write_table(rows, sink, compression="zstd", store_schema=False, write_page_checksum=True)
+    atomic_write_bytes(path, sink.getvalue())
+
+
+def read_rows(path: StrPath) -> pa.Table:
+    """Read what :func:`write_rows` wrote.
+
+    Raises:
+        ValueError: no such file, not Parquet, damaged, or not of ``SCHEMA``; names file and column.
+    """
+    try:
+        content = pa.BufferReader(Path(path).read_bytes())
+        table = pq.ParquetFile(content, page_checksum_verification=True).read(use_threads=False)
+    except (OSError, pa.ArrowException) as error:
+        raise ValueError(f"{path}: cannot be read as results: {error}") from None
+    return check(table, str(path))
+
+
+def _sorted(rows: pa.Table, keys: Sequence[str]) -> pa.Table:
+    return rows.take(_order(rows, keys))
+
+
+def _order(rows: pa.Table, keys: Sequence[str]) -> pa.Array:
+    return pc.sort_indices(rows, sort_keys=[(key, "ascending") for key in keys])
+
+
+def _same_as_before(rows: pa.Table, keys: Sequence[str]) -> NDArray[np.bool_]:
+    """For each row but the first (T - 1,): whether it has the keys of the row before."""
+    same = np.ones(max(rows.num_rows - 1, 0), dtype=bool)
+    for key in keys:
+        column = rows[key].combine_chunks()
+        same &= pc.equal(column[1:], column[:-1]).to_numpy(zero_copy_only=False)
+    return same
+
+
+def merge(paths: Sequence[StrPath], path: StrPath) -> pa.Table:
+    """Join result files into one, sorted by ``KEY``: the same bytes in whatever order the parts come.
+
+    Returns:
+        The rows written to ``path``.
+
+    Raises:
+        ValueError: no parts, an unreadable part, or an episode that occurs twice.
+    """
+    if not paths:
+        raise ValueError(f"{path}: no result files to merge")
+    parts = [read_rows(part) for part in paths]
+    source = np.repeat(np.arange(len(parts)), [part.num_rows for part in parts])
+    rows = pa.concat_tables(parts)
+    order = _order(rows, KEY)
+    rows = rows.take(order)
+    doubled = np.flatnonzero(_same_as_before(rows, KEY))
+    if doubled.size:
+        first = int(doubled[0])
+        episode = ", ".join(f"{key} {rows[key][first].as_py()}" for key in KEY)
+        files = sorted({str(paths[i]) for i in source[order.to_numpy()[first : first + 2]]})
+        raise ValueError(f"{path}: the episode of {episode} occurs twice, in {' and '.join(files)}")
+    write_rows(path, rows)
+    return rows
+
+
+@dataclass(frozen=True, slots=True)
+class SummaryRow:
+    """What the episodes of one (env, agent, noise model, noise level) amount to; a line of summary.csv.
+
+    Rates lie in [0, 1]; ``low`` and ``high`` are their 95 % Wilson interval over all episodes.
+    """
+
+    env: str
+    agent: str
+    noise_model: str
+    noise_level: float
+    train_seeds: int  # how many
+    episodes: int
+    safety_rate: float
+    safety_low: float
+    safety_high: float
+    reach_rate: float
+    reach_low: float
+    reach_high: float
+    arrival_rate: float
+    mean_cost: float
+    mean_steps: float
+
+
+def summarise(rows: pa.Table, agents: Sequence[str] = ()) -> list[SummaryRow]:
+    """A line per (env, agent, noise model, noise level), in that order.
+
+    Args:
+        rows: episodes, in any order.
+        agents: the order of the agents; those not named follow, by name.
+    """
+    rank = {agent: index for index, agent in enumerate(agents)}
+    # Sorted down to the episode, so that sums of floats do not depend on how the rows came.
+    rows = _sorted(rows, (*_GROUP, "train_seed", "scenario")).combine_chunks()
+    edges = np.unique([0, *(np.flatnonzero(~_same_as_before(rows, _GROUP)) + 1), rows.num_rows])
+    summary = [_summarise_group(rows[int(a) : int(b)]) for a, b in itertools.pairwise(edges)]
+    return sorted(
+        summary,
+        key=lambda r: (r.env, rank.get(r.agent, len(rank)), r.agent, r.noise_model, r.noise_level),
+    )
+
+
+def _summarise_group(rows: pa.Table) -> SummaryRow:
+    n = rows.num_rows
+    safety, reach = stats.safety_rate(rows), stats.reach_rate(rows)
+    low, high = stats.wilson(np.rint([safety * n, reach * n]), n)
+    return SummaryRow(
+        **{name: rows[name][0].as_py() for name in _GROUP},
+        train_seeds=len(rows["train_seed"].unique()),
+        episodes=n,
+        safety_rate=safety,
+        safety_low=float(low[0]),
+        safety_high=float(high[0]),
+        reach_rate=reach,
+        reach_low=float(low[1]),
+        reach_high=float(high[1]),
+        arrival_rate=stats.arrival_rate(rows),
+        mean_cost=float(rows["episode_cost"].to_numpy().mean()),
+        mean_steps=float(rows["steps"].to_numpy().mean()),
+    )
+
+
+def headline_level(summary: Sequence[SummaryRow]) -> float:
+    """The noise level that figures and sentences speak of: the paper's, 1, or the measured one nearest it."""
+    return min({row.noise_level for row in summary}, key=lambda level: (abs(level - 1), level))
+
+
+def write_summary_csv(path: StrPath, summary: Sequence[SummaryRow]) -> None:
+    """Write a summary as CSV: columns as in :class:`SummaryRow`, floats to six significant digits."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([field.name for field in fields(SummaryRow)])
+    for row in summary:
+        writer.writerow([f"{v:.6g}" if isinstance(v, float) else v for v in asdict(row).values()])
+    atomic_write_text(path, text.getvalue())
