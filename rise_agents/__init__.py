@@ -12,6 +12,8 @@ from typing import Any
 
 from rise_agents.agent import Agent, nearest
 
+__version__ = "0.1.0"
+
 # name -> "module:Class". A new agent is one file and one line here.
 AGENTS: dict[str, str] = {
     "rise": "rise_agents.rise:Rise",
@@ -63,5 +65,7 @@ def load_agent(path: str | os.PathLike[str], env_id: str | None = None, device: 
     if name not in AGENTS:
         raise checkpoint.CheckpointError(path, f"holds an unknown agent {name!r}", "update the package")
     if env_id is not None and env != env_id:
-        raise checkpoint.CheckpointError(path, f"was trained on {env!r}, not {env_id!r}", "train on that environment")
+        raise checkpoint.CheckpointError(
+            path, f"was trained on {env!r}, not {env_id!r}", "train on that environment"
+        )
     return agent_class(name).from_checkpoint(arrays, description, device)

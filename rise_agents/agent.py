@@ -9,6 +9,7 @@ state, so that what it does in an episode depends on the episode's key only, not
 from __future__ import annotations
 
 import difflib
+import os
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, fields
 from typing import Any, Protocol, runtime_checkable
@@ -47,15 +48,19 @@ class Agent(Policy, Protocol):
     Attributes:
         learns_from: ``"demonstrations"`` or ``"environment"``, what :meth:`learn` is given.
         evaluate_deterministic: how the agent is meant to act when it is judged.
+        Config: the frozen dataclass of its settings.
+        PRESETS: per environment id, settings that serve better there than the defaults.
     """
 
+    Config: type
+    PRESETS: dict[str, dict[str, Any]]
     learns_from: str
     evaluate_deterministic: bool
 
     def learn(self, source: Any, progress: Progress = silent) -> Agent:
         """Train on demonstrations, or in the environment whose id is given."""
 
-    def save(self, path: str) -> None:
+    def save(self, path: str | os.PathLike[str]) -> None:
         """Store everything that :func:`rise_agents.load_agent` needs."""
 
 
@@ -96,6 +101,11 @@ def config_from_dict(kind: type, values: dict[str, Any]) -> Any:
     return kind(**plain)
 
 
+def make_config(kind: Any, env_id: str, values: dict[str, Any]) -> Any:
+    """The complete settings of an agent class for an environment: its defaults there, with ``values`` over them."""
+    return config_from_dict(kind.Config, {**kind.PRESETS.get(env_id, {}), **values})
+
+
 def config_to_dict(config: Any) -> dict[str, Any]:
     """The inverse of :func:`config_from_dict`, fit for JSON."""
     return {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(config).items()}
@@ -107,7 +117,7 @@ def require(condition: bool, what: str, value: Any) -> None:
         raise ValueError(f"{what}, got {value!r}")
 
 
-def fresh_state(keys: NDArray[np.uint64]) -> State:
+def fresh_state(keys: NDArray[np.uint64]) -> tuple[NDArray, ...]:
     """The state of a policy that draws: a key and a counter for each row."""
     return np.asarray(keys, np.uint64), np.zeros(len(keys), np.uint64)
 

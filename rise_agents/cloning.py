@@ -52,7 +52,11 @@ class CloningConfig:
         for name in ("updates", "batch_size"):
             require(getattr(self, name) >= 1, f"{name} must be at least 1", getattr(self, name))
         require(self.learning_rate > 0, "learning_rate must be positive", self.learning_rate)
-        require(self.transitions is None or self.transitions >= 1, "transitions must be positive", self.transitions)
+        require(
+            self.transitions is None or self.transitions >= 1,
+            "transitions must be positive",
+            self.transitions,
+        )
 
 
 @dataclass(frozen=True)

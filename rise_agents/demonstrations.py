@@ -20,13 +20,12 @@ import numpy as np
 import safetensors.numpy as st
 from numpy.typing import NDArray
 
-import rise_envs  # noqa: F401  registers the environments
+import rise_envs
 from rise_agents.checkpoint import replace_file, versions
 from rise_agents.experts import make_expert
-from rise_agents.rollout import POLICY_TAG, Transitions, rollout
+from rise_agents.rollout import Transitions, policy_keys, rollout
 from rise_agents.seeds import episode_seeds
 from rise_agents.workers import make_pool
-from rise_envs import streams
 from rise_envs.task import env_class
 
 SCHEMA = 1
@@ -139,10 +138,12 @@ def load(folder: str | os.PathLike[str]) -> Demonstrations:
 
 def from_arrays(env_id: str, arrays: dict[str, NDArray], card: dict[str, Any]) -> Demonstrations:
     """A checked set from named arrays, the inverse of :meth:`Demonstrations.arrays`."""
-    grouped = {
+    grouped: dict[str, Any] = {
         group: {key: arrays[f"{group}.{key}"] for key in OBSERVATIONS} for group in ("observations", "final")
     }
-    rest = {name: arrays[name] for name in ("actions", "rewards", "costs", "offsets", "seeds", "expert")}
+    rest: dict[str, Any] = {
+        name: arrays[name] for name in ("actions", "rewards", "costs", "offsets", "seeds", "expert")
+    }
     demonstrations = Demonstrations(env_id=env_id, **grouped, **rest, card=card)
     check(demonstrations)
     return demonstrations
@@ -176,21 +177,24 @@ def _check_rows(name: str, array: NDArray, rows: int, space: Any) -> None:
     if array.shape != (rows, *space.shape) or array.dtype != np.float64:
         raise DatasetError(f"{name} is {array.dtype} {array.shape}, not float64 {(rows, *space.shape)}")
     if not np.isfinite(array).all():
-        raise DatasetError(f"{name} holds a number that is not finite in row {np.argwhere(~np.isfinite(array))[0][0]}")
+        raise DatasetError(
+            f"{name} holds a number that is not finite in row {np.argwhere(~np.isfinite(array))[0][0]}"
+        )
     margin = 1e-6 * (1 + np.abs(space.high))  # actions are float32 in the environment
     outside = (array < space.low - margin) | (array > space.high + margin)
     if outside.any():
         raise DatasetError(f"{name} leaves the bounds of the environment in row {np.argwhere(outside)[0][0]}")
 
 
-def _candidates(env_id: str, expert: str, seed: int, start: int, count: int) -> tuple[Transitions, Any, Any, Any]:
+def _candidates(
+    env_id: str, expert: str, seed: int, start: int, count: int
+) -> tuple[Transitions, Any, Any, Any]:
     """Roll out candidate episodes; returns them with what is needed to choose and describe them."""
     policy = make_expert(expert, env_id, seed=seed)
     seeds = episode_seeds("train", seed, start, count)
     episodes, transitions = rollout(policy, env_id, seeds, record=True)
-    keys = np.array([streams.key_from_seed(int(s), POLICY_TAG) for s in seeds], np.uint64)
     choose = getattr(policy, "choose", None)
-    chosen = choose(keys) if choose else np.zeros(count, np.int64)
+    chosen = choose(policy_keys(seeds)) if choose else np.zeros(count, np.int64)
     assert transitions is not None  # noqa: S101  record=True
     return transitions, episodes.reached, seeds, np.asarray(chosen, np.int64)
 
@@ -226,7 +230,9 @@ def generate(
         if kept >= episodes:
             break
         if tried >= 20 * CHUNK and kept < 0.05 * tried:
-            raise ValueError(f"expert {expert!r} succeeds in {kept} of {tried} episodes of {env_id}: no use going on")
+            raise ValueError(
+                f"expert {expert!r} succeeds in {kept} of {tried} episodes of {env_id}: no use going on"
+            )
     return _assemble(env_id, expert, episodes, seed, parts)
 
 
@@ -237,7 +243,7 @@ def _ordered(env_id: str, expert: str, episodes: int, seed: int, workers: int) -
             yield _candidates(env_id, expert, seed, start, CHUNK)
     with make_pool(workers) as pool:
         try:
-            queue = [
+            queue: list[Any] = [
                 pool.submit(_candidates, env_id, expert, seed, i * CHUNK, CHUNK)
                 for i in range(max(workers, -(-episodes // CHUNK)))
             ]

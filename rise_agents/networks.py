@@ -5,9 +5,9 @@ Shapes: B batch, M samples, C reading inputs, Z latent.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
-import torch
 from torch import Tensor, nn
 
 # σ stays in [e⁻⁷, e³]: wide enough for any unit, finite in float32 whatever the reading.
@@ -18,7 +18,7 @@ def mlp(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequential:
     """Fully connected layers with ReLU between them, (…, inputs) → (…, outputs)."""
     widths = [inputs, *hidden]
     layers: list[nn.Module] = []
-    for width, following in zip(widths[:-1], widths[1:], strict=True):
+    for width, following in itertools.pairwise(widths):
         layers += [nn.Linear(width, following), nn.ReLU()]
     return nn.Sequential(*layers, nn.Linear(widths[-1], outputs))
 
@@ -38,7 +38,7 @@ class Encoder(nn.Module):
 
 
 def reparameterise(mu: Tensor, log_sigma: Tensor, epsilon: Tensor) -> Tensor:
-    """z = μ + σ ⊙ ε (paper, equation 2)."""
+    """The sample z = μ + σ ⊙ ε (paper, equation 2)."""
     return mu + log_sigma.exp() * epsilon
 
 

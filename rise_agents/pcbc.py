@@ -6,7 +6,7 @@ The same inputs, data, network, loss and budget as RISE, without the encoder: a 
 from __future__ import annotations
 
 import os
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rise_agents import cloning
-from rise_agents.agent import Progress, State, config_from_dict, silent
+from rise_agents.agent import Progress, State, make_config, silent
 from rise_agents.cloning import ActionUnits, CloningConfig, CloningData, Eyes
 from rise_agents.networks import mlp
 from rise_agents.readings import as_batch, is_batched
@@ -34,12 +34,14 @@ class PCBC:
     """
 
     name = "pcbc"
+    Config = Config
+    PRESETS: ClassVar[dict[str, dict[str, Any]]] = {}
     learns_from = "demonstrations"
     evaluate_deterministic = True
 
     def __init__(self, env_id: str, config: dict[str, Any], seed: int = 0, device: str = "cpu") -> None:
         self.env_id, self.seed, self.device = env_id, seed, device
-        self.config: Config = config_from_dict(Config, config)
+        self.config = make_config(type(self), env_id, config)
         self.task, self.units = cloning.make_task(env_id), ActionUnits.of(env_id)
         self._arrays: dict[str, NDArray] = {}
 
@@ -77,7 +79,7 @@ class PCBC:
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = False,
     ) -> tuple[NDArray[np.float32], State]:
-        """Actions (B, A) for a batch of observations, or (A,) for one; the same whatever ``deterministic``."""
+        """Actions (B, A) for a batch of observations, or (A,) for one; nothing is drawn."""
         if not self._arrays:
             raise cloning.untrained(self.name)
         robot, reading = self._eyes(as_batch(observation))

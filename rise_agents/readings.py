@@ -7,8 +7,8 @@ Every agent reads through this file, so that frames are compared on equal terms:
 ``body``
     goal and readings relative to the robot: turned into the vehicle's heading frame, or relative to the hand.
 ``features``
-    geometric quantities of the body frame (distances, clearance, closing speed, the angle an obstacle covers, its
-    offset from the straight way) that make the avoidance rule nearly linear.
+    geometric quantities of the body frame (distances, clearance, closing speed, the angle an obstacle
+    covers, its offset from the straight way) that make the avoidance rule nearly linear.
 
 Shapes: B batch, R robot inputs, C reading inputs, N obstacles, D dimensions.
 """
@@ -97,8 +97,24 @@ def obstacle_features(
     aside = position - along * way[:, None]
     offset = np.linalg.norm(aside, axis=-1, keepdims=True)
     parts = [
-        *(position, velocity, radius[..., None], distance, towards, distance - reach, closing, across, covered),
-        *(along, along - goal_distance[:, None], aside, offset - reach, (towards * way[:, None]).sum(-1, keepdims=True)),
+        *(
+            position,
+            velocity,
+            radius[..., None],
+            distance,
+            towards,
+            distance - reach,
+            closing,
+            across,
+            covered,
+        ),
+        *(
+            along,
+            along - goal_distance[:, None],
+            aside,
+            offset - reach,
+            (towards * way[:, None]).sum(-1, keepdims=True),
+        ),
     ]
     if task.dim == 2:  # signed angles and offsets exist in the plane only
         side = (way[:, None, 0] * position[..., 1] - way[:, None, 1] * position[..., 0])[..., None]
@@ -110,8 +126,8 @@ def obstacle_features(
 def reading_units(task: Task, frame: str, observation: dict[str, Array], draws: int = 8) -> Array:
     """How much noise of level 1 moves each reading input, (C,): the units of the reading noise.
 
-    In the world and body frames this is the noise scale itself (noise is isotropic, and turning keeps it); for
-    features it is measured as the root mean square change over ``draws`` noisy copies of each observation.
+    In the world and body frames this is the noise scale itself (noise is isotropic, and turning keeps it);
+    for features it is the root mean square change over ``draws`` noisy copies of each observation.
     """
     scale = np.asarray(task.noise_scale)
     if frame != "features":

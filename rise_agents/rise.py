@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from rise_agents import cloning, readings
-from rise_agents.agent import Progress, State, config_from_dict, draw_state, fresh_state, require, silent
+from rise_agents.agent import Progress, State, draw_state, fresh_state, make_config, require, silent
 from rise_agents.cloning import ActionUnits, CloningConfig, CloningData, Eyes
 from rise_agents.networks import LOG_SIGMA_RANGE, Encoder, gaussian_kl, mlp, reparameterise
 from rise_agents.training import Forward, fit, to_arrays
@@ -59,7 +59,9 @@ class Config(CloningConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         require(self.beta >= 0, "beta must not be negative", self.beta)
-        require(all(w >= 1 for w in self.encoder_hidden), "encoder_hidden must hold widths", self.encoder_hidden)
+        require(
+            all(w >= 1 for w in self.encoder_hidden), "encoder_hidden must hold widths", self.encoder_hidden
+        )
         for name in ("latent", "n_samples", "vae_updates", "vae_batch_size", "average"):
             require(getattr(self, name) >= 1, f"{name} must be at least 1", getattr(self, name))
         require(len(self.encoder_hidden) >= 1, "encoder_hidden needs a layer", self.encoder_hidden)
@@ -90,7 +92,13 @@ class VAE(nn.Module):
 
 
 def policy_loss(
-    policy: nn.Module, robot: Tensor, mu: Tensor, log_sigma: Tensor, action: Tensor, epsilon: Tensor, kind: str
+    policy: nn.Module,
+    robot: Tensor,
+    mu: Tensor,
+    log_sigma: Tensor,
+    action: Tensor,
+    epsilon: Tensor,
+    kind: str,
 ) -> dict[str, Tensor]:
     """The loss of stage 2, averaged over M posterior samples (Algorithm 1, lines 14 to 19).
 
@@ -119,12 +127,14 @@ class Rise:
     """
 
     name = "rise"
+    Config = Config
+    PRESETS: ClassVar[dict[str, dict[str, Any]]] = {}
     learns_from = "demonstrations"
     evaluate_deterministic = False  # the paper draws z from the posterior at inference
 
     def __init__(self, env_id: str, config: dict[str, Any], seed: int = 0, device: str = "cpu") -> None:
         self.env_id, self.seed, self.device = env_id, seed, device
-        self.config: Config = config_from_dict(Config, config)
+        self.config = make_config(type(self), env_id, config)
         self.task, self.units = cloning.make_task(env_id), ActionUnits.of(env_id)
         self._rng = np.random.default_rng(seed)
         self._arrays: dict[str, NDArray] = {}
@@ -139,7 +149,9 @@ class Rise:
         # Standard units → units of the reading noise: what the decoder answers in.
         sample = demonstrations.subsample(20_000)
         noise = readings.reading_units(self.task, c.frame, sample)
-        ratio = torch.from_numpy((eyes.reading.scale / np.maximum(noise, 1e-9)).astype(np.float32)).to(self.device)
+        ratio = torch.from_numpy((eyes.reading.scale / np.maximum(noise, 1e-9)).astype(np.float32)).to(
+            self.device
+        )
         share = c.vae_updates / (c.vae_updates + c.updates)
 
         vae = VAE(data.reading.shape[1], c).to(self.device)
@@ -214,7 +226,10 @@ class Rise:
         self._arrays = arrays
         self._eyes = Eyes.from_arrays(self.task, self.config.frame, arrays)
         self._trunk = Forward(arrays, "vae.encoder.trunk")
-        self._heads = [(arrays[f"vae.encoder.{h}.weight"].T, arrays[f"vae.encoder.{h}.bias"]) for h in ("mu", "log_sigma")]
+        self._heads = [
+            (arrays[f"vae.encoder.{h}.weight"].T, arrays[f"vae.encoder.{h}.bias"])
+            for h in ("mu", "log_sigma")
+        ]
         self._policy = Forward(arrays, "policy")
         return self
 

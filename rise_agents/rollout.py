@@ -22,7 +22,7 @@ from rise_envs.noise_wrappers import VectorObservationNoise
 
 # Slots that run side by side: batched environments share every array operation, the others only the policy's.
 BATCHED_SLOTS, SINGLE_SLOTS = 512, 4
-POLICY_TAG = 0x9011C7
+_POLICY_TAG = 0x9011C7
 
 
 @dataclass(frozen=True)
@@ -54,6 +54,11 @@ class Transitions:
     offsets: NDArray[np.int64]
 
 
+def policy_keys(noise_seeds: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint64]:
+    """The keys that policies draw from in the episodes with these noise seeds, (E,)."""
+    return np.array([streams.key_from_seed(int(seed), _POLICY_TAG) for seed in noise_seeds], np.uint64)
+
+
 def is_batched_env(env_id: str) -> bool:
     """Whether the environment has a native batched form."""
     return gym.spec(env_id).vector_entry_point is not None
@@ -61,7 +66,7 @@ def is_batched_env(env_id: str) -> bool:
 
 def make_slots(env_id: str, slots: int, **kwargs: Any) -> VectorEnv:
     """``slots`` sub-environments whose resets are ours to call."""
-    mode = {"autoreset_mode": AutoresetMode.DISABLED}
+    mode: dict[str, Any] = {"autoreset_mode": AutoresetMode.DISABLED}
     if is_batched_env(env_id):
         return gym.make_vec(env_id, slots, vectorization_mode="vector_entry_point", **mode, **kwargs)
     return gym.make_vec(env_id, slots, vectorization_mode="sync", vector_kwargs=mode, **kwargs)
@@ -103,7 +108,7 @@ def rollout(
     noise_seeds = env_seeds if noise_seeds is None else np.asarray(noise_seeds, np.int64)
     total = len(env_seeds)
     slots = min(slots or (BATCHED_SLOTS if is_batched_env(env_id) else SINGLE_SLOTS), total)
-    keys = np.array([streams.key_from_seed(int(seed), POLICY_TAG) for seed in noise_seeds], np.uint64)
+    keys = policy_keys(noise_seeds)
 
     env = make_slots(env_id, slots, **(env_kwargs or {}))
     if noise_level > 0:
@@ -117,7 +122,8 @@ def rollout(
         options: dict[str, Any] = {"reset_mask": rows}
         if noise_level > 0:
             options["noise_seed"] = noise_seeds[pick]
-        return env.reset(seed=[int(s) for s in env_seeds[pick]], options=options)[0]
+        seeds: Any = [int(s) for s in env_seeds[pick]]  # a list is fine, whatever VectorEnv declares
+        return env.reset(seed=seeds, options=options)[0]
 
     try:
         everyone = np.ones(slots, bool)
@@ -202,7 +208,9 @@ class _Log:
         keys = self.observations[0]
         offsets = np.concatenate(([0], np.cumsum(np.bincount(episode[order], minlength=total))))
         return Transitions(
-            observations={key: np.concatenate([row[key] for row in self.observations])[order] for key in keys},
+            observations={
+                key: np.concatenate([row[key] for row in self.observations])[order] for key in keys
+            },
             actions=actions[order],
             rewards=rewards[order],
             costs=costs[order],

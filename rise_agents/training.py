@@ -57,7 +57,9 @@ def fit(
 
 def to_arrays(module: nn.Module, name: str) -> dict[str, NDArray[np.float32]]:
     """The weights of ``module`` as arrays, under ``name``."""
-    return {f"{name}.{key}": value.detach().cpu().numpy().copy() for key, value in module.state_dict().items()}
+    return {
+        f"{name}.{key}": value.detach().cpu().numpy().copy() for key, value in module.state_dict().items()
+    }
 
 
 class Forward:
@@ -65,7 +67,11 @@ class Forward:
 
     def __init__(self, arrays: dict[str, NDArray], name: str) -> None:
         layers = sorted(
-            {int(key.split(".")[-2]) for key in arrays if key.startswith(f"{name}.") and key.endswith("weight")}
+            {
+                int(key.split(".")[-2])
+                for key in arrays
+                if key.startswith(f"{name}.") and key.endswith("weight")
+            }
         )
         # Transposed once, in the layout that a row vector times a matrix reads in order.
         self.layers = [

@@ -14,12 +14,16 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def make_pool(workers: int) -> ProcessPoolExecutor:
-    """A pool of freshly started processes (a fork would copy the parent's threads and engines).
+def limit_threads() -> None:
+    """Tell the numeric libraries of processes started from here on to keep to one thread each.
 
-    Several single-threaded workers beat one worker with several threads on networks of this size, so the
-    numeric libraries of the workers are told to keep to one thread.
+    Several single-threaded workers beat one worker with several threads on networks of this size.
     """
     for name in _THREADS:
         os.environ.setdefault(name, "1")
+
+
+def make_pool(workers: int) -> ProcessPoolExecutor:
+    """A pool of freshly started processes (a fork would copy the parent's threads and engines)."""
+    limit_threads()
     return ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))

@@ -1,0 +1,220 @@
+"""The pieces of work of a run. A job is a pure function of its arguments that ends by writing its output file.
+
+A job whose output exists is done, whoever did it and whenever: that is all there is to resuming. File names
+carry a digest of everything the file depends on, so changed settings never meet old results.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from benchmarks import results
+from benchmarks.policies import make_policy
+from benchmarks.protocol import Plan, Scenarios, digest
+from benchmarks.videos import record
+from rise_agents import AGENTS, __version__, agent_class, demonstrations, make_agent
+from rise_agents.agent import Progress, make_config, silent
+from rise_agents.rollout import rollout
+
+CLIP_EPISODES = 3  # test scenarios that a clip shows
+
+
+@dataclass(frozen=True)
+class Job:
+    """A piece of work.
+
+    Attributes:
+        name: for people.
+        run: module-level function ``run(output, progress, **arguments)``.
+        arguments: its arguments.
+        output: the file whose existence says that the job is done.
+        needs: outputs of other jobs that must exist first.
+        weight: rough relative duration; long jobs start first.
+    """
+
+    name: str
+    run: Callable[..., None]
+    arguments: dict[str, Any]
+    output: Path
+    needs: tuple[Path, ...] = ()
+    weight: float = 1.0
+
+
+def demonstrations_folder(plan: Plan, env: str, out: Path) -> Path:
+    """Where the demonstrations of a plan lie."""
+    return out / "demonstrations" / f"{env}-{digest(__version__, env, plan.expert, plan.demos)}"
+
+
+def checkpoint_path(plan: Plan, env: str, agent: str, seed: int, out: Path) -> Path:
+    """Where a trained agent of a plan lies."""
+    source = [plan.expert, plan.demos] if imitates(agent) else []
+    mark = digest(__version__, env, agent, seed, plan.config(agent, env), source)
+    return out / "agents" / env / f"{agent}-seed{seed}-{mark}.rise"
+
+
+def imitates(agent: str) -> bool:
+    """Whether an agent learns from demonstrations."""
+    return agent_class(agent).learns_from == "demonstrations"
+
+
+def training_jobs(plan: Plan, out: Path, device: str) -> list[Job]:
+    """One job for each agent, environment and training seed."""
+    jobs = []
+    for env in plan.envs:
+        for agent, seed in plan.rows(env):
+            if agent not in AGENTS:
+                continue
+            folder = demonstrations_folder(plan, env, out)
+            clones = imitates(agent)
+            arguments = {"env": env, "agent": agent, "seed": seed, "config": plan.config(agent, env)}
+            arguments |= {"data": folder if clones else None, "device": device}
+            output = checkpoint_path(plan, env, agent, seed, out)
+            name = f"train {agent} on {env}" + (f", seed {seed}" if plan.seeds > 1 else "")
+            jobs.append(Job(name, train, arguments, output, (), weight=10.0 if clones else 100.0))
+    return jobs
+
+
+def evaluation_jobs(plan: Plan, out: Path) -> list[Job]:
+    """One job for each row, noise level and portion of the scenarios."""
+    jobs = []
+    for env in plan.envs:
+        for row, seed in plan.rows(env):
+            trained = checkpoint_path(plan, env, row, seed, out) if row in AGENTS else None
+            for level in plan.noise_levels:
+                for part in plan.chunks(env):
+                    arguments: dict[str, Any] = {"env": env, "row": row, "seed": seed, "checkpoint": trained}
+                    arguments |= {"noise_model": plan.noise_model, "noise_level": level, "scenarios": part}
+                    source = trained.name if trained else __version__
+                    mark = digest(env, row, seed, source, plan.noise_model, level, part.start, part.count)
+                    output = (
+                        out
+                        / "parts"
+                        / env
+                        / f"{row}-seed{seed}-{plan.noise_model}{level:g}-{part.start}-{mark}.parquet"
+                    )
+                    name = f"evaluate {row} on {env} at noise {level:g}"
+                    jobs.append(Job(name, evaluate, arguments, output, (trained,) if trained else ()))
+    return jobs
+
+
+def video_jobs(plan: Plan, out: Path) -> list[Job]:
+    """One clip for each row of the tables, of its first training seed, at the headline noise level."""
+    level = min(plan.noise_levels, key=lambda x: (abs(x - 1), x))
+    jobs = []
+    for env in plan.envs:
+        for row, seed in plan.rows(env):
+            if seed:
+                continue
+            trained = checkpoint_path(plan, env, row, 0, out) if row in AGENTS else None
+            seeds = [int(s) for s in Scenarios(0, min(CLIP_EPISODES, plan.episodes)).seeds()]
+            arguments = {"env": env, "row": row, "checkpoint": trained, "seeds": seeds}
+            arguments |= {"noise_model": plan.noise_model, "noise_level": level}
+            mark = digest(env, row, trained.name if trained else __version__, plan.noise_model, level, seeds)
+            output = out / "videos" / f"{env}-{row}-{mark}.mp4"
+            needs = (trained,) if trained else ()
+            jobs.append(Job(f"draw {row} on {env}", record, arguments, output, needs, weight=0.5))
+    return jobs
+
+
+def check_settings(plan: Plan) -> None:
+    """Raise ``ValueError`` if a setting of a trained agent is unknown or out of range."""
+    for env in plan.envs:
+        for agent in plan.agents:
+            if agent in AGENTS:
+                try:
+                    make_config(agent_class(agent), env, plan.config(agent, env))
+                except (TypeError, ValueError) as error:
+                    raise ValueError(f"settings of {agent}: {error}") from None
+
+
+def generate_demonstrations(
+    plan: Plan, env: str, folder: Path, workers: int, progress: Progress = silent
+) -> None:
+    """Record the demonstrations of an environment, unless they are there already."""
+    if (folder / demonstrations.CARD).exists():
+        return
+
+    def tell(kept: int, tried: int) -> None:
+        progress(kept / plan.demos, {"kept": kept, "tried": tried})
+
+    demonstrations.generate(env, plan.expert, plan.demos, workers=workers, finished=tell).save(folder)
+
+
+def train(
+    output: Path,
+    progress: Progress,
+    env: str,
+    agent: str,
+    seed: int,
+    config: dict[str, Any],
+    data: Path | None,
+    device: str,
+) -> None:
+    """Train one agent; writes its checkpoint and, beside it, a JSON record of the training."""
+    started, curve = time.perf_counter(), []
+
+    def tell(share: float, figures: dict[str, float]) -> None:
+        curve.append({"share": share, **figures})
+        progress(share, figures)
+
+    learner = make_agent(agent, env, config, seed, device)
+    learner.learn(env if data is None else demonstrations.load(data), tell)
+    record = {"seconds": round(time.perf_counter() - started, 1), "device": device, "curve": curve}
+    results.atomic_write_text(output.with_suffix(".json"), json.dumps(record) + "\n")
+    learner.save(output)
+
+
+def evaluate(
+    output: Path,
+    progress: Progress,
+    env: str,
+    row: str,
+    seed: int,
+    checkpoint: Path | None,
+    noise_model: str,
+    noise_level: float,
+    scenarios: Scenarios,
+) -> None:
+    """Run one policy through a portion of the scenarios; writes a row per episode."""
+    policy = make_policy(env, row, checkpoint)
+    seeds, done = scenarios.seeds(), 0
+
+    def tell(count: int) -> None:
+        nonlocal done
+        done += count
+        progress(done / len(seeds), {})
+
+    episodes, _ = rollout(
+        policy,
+        env,
+        seeds,
+        noise=noise_model,
+        noise_level=noise_level,
+        deterministic=getattr(policy, "evaluate_deterministic", True),
+        finished=tell,
+    )
+    table = results.from_columns(
+        {
+            "env": env,
+            "agent": row,
+            "train_seed": seed,
+            "noise_model": noise_model,
+            "noise_level": float(noise_level),
+            "scenario": range(scenarios.start, scenarios.start + scenarios.count),
+            "env_seed": seeds,
+            "noise_seed": seeds,
+            "safe": episodes.safe,
+            "arrived": episodes.arrived,
+            "reached": episodes.reached,
+            "steps": episodes.steps,
+            "episode_cost": episodes.cost,
+            "min_clearance": episodes.min_clearance,
+            "episode_return": episodes.episode_return,
+        }
+    )
+    results.write_rows(output, table)

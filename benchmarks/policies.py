@@ -1,0 +1,49 @@
+"""The policies that are evaluated: trained agents, experts, and chance."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rise_agents import load_agent
+from rise_agents.agent import State, draw_state, fresh_state
+from rise_agents.cloning import ActionUnits
+from rise_agents.experts import make_expert
+from rise_agents.readings import as_batch, is_batched
+from rise_envs import streams
+
+
+class Random:
+    """Uniform actions within the bounds."""
+
+    evaluate_deterministic = False
+
+    def __init__(self, env_id: str) -> None:
+        self.units = ActionUnits.of(env_id)
+
+    def initial_state(self, keys: NDArray[np.uint64]) -> State:
+        """Streams for episodes with the given keys (B,)."""
+        return fresh_state(keys)
+
+    def predict(
+        self, observation: Any, state: State = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[NDArray[np.float32], State]:
+        """Actions (B, A), or (A,) for one observation."""
+        rows = len(as_batch(observation)["desired_goal"])
+        keys, counter = draw_state(state, episode_start, rows, np.random.default_rng(0))
+        size = len(self.units.low)
+        draws = counter[:, None] * np.uint64(size) + np.arange(size, dtype=np.uint64)
+        action = self.units.to_action(2 * streams.uniform(keys[:, None], draws) - 1)
+        return (action if is_batched(observation) else action[0]), (keys, counter + np.uint64(1))
+
+
+def make_policy(env_id: str, row: str, checkpoint: Path | None) -> Any:
+    """The policy of a row of the tables: a trained agent (from its checkpoint), an expert, or chance."""
+    if checkpoint is not None:
+        return load_agent(checkpoint, env_id)
+    if row == "random":
+        return Random(env_id)
+    return make_expert(row.removeprefix("expert-"), env_id)

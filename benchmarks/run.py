@@ -1,0 +1,190 @@
+"""The benchmark's command line: ``python -m benchmarks.run --agents rise pcbc cppo``.
+
+Records demonstrations, trains what is not trained yet, runs every agent through the same noisy scenarios, and
+writes tables, figures and videos. Run it again in the same folder and it continues where it stopped.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from benchmarks.protocol import PRESETS, Plan, make_plan
+
+_EXAMPLES = """\
+examples:
+  python -m benchmarks.run --agents rise pcbc cppo                    both tasks, 1,000 scenarios, about 15 minutes
+  python -m benchmarks.run --agents rise pcbc --envs RISE-GroundVehicle-v0 --noise-model episode
+  python -m benchmarks.run --agents expert random --noise-levels 0    what the experts reach on true readings
+  python -m benchmarks.run --agents rise --set rise.beta=0.1 --out runs/beta-0.1
+  python -m benchmarks.run --agents rise pcbc cppo --preset smoke     everything once, in a minute
+
+A run that was stopped continues where it was: give the same command again.
+"""
+
+
+class _Parser(argparse.ArgumentParser):
+    """An argument parser whose errors are one line."""
+
+    def error(self, message: str) -> NoReturn:
+        raise ValueError(message)
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    p = _Parser(
+        prog="python -m benchmarks.run",
+        description="Compare agents on noisy obstacle readings: train, evaluate, tables, figures, videos.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    p.add_argument(
+        "--agents",
+        nargs="+",
+        default=["rise", "pcbc", "cppo"],
+        metavar="NAME",
+        help="agents to compare; 'expert' and 'random' add reference rows (default: rise pcbc cppo)",
+    )
+    p.add_argument("--envs", nargs="+", metavar="ID", help="environments (default: all of the suite)")
+    p.add_argument(
+        "--preset",
+        default="quick",
+        metavar="NAME",
+        help=f"how much is trained and measured: {', '.join(PRESETS)} (default: quick)",
+    )
+    p.add_argument("--seeds", type=int, metavar="N", help="training seeds per agent")
+    p.add_argument(
+        "--episodes", type=int, metavar="N", help="test scenarios per condition (preset quick: 1,000)"
+    )
+    p.add_argument(
+        "--noise-levels",
+        nargs="+",
+        type=float,
+        metavar="X",
+        help="multiples of the environment's reading noise (preset quick: 0 0.5 1 2)",
+    )
+    p.add_argument(
+        "--noise-model",
+        default="step",
+        metavar="MODEL",
+        help="step, episode, drift, dropout, delay, quantise, or a sum as in step+episode (default: step)",
+    )
+    p.add_argument("--demos", type=int, metavar="N", help="expert episodes to learn from, per environment")
+    p.add_argument("--expert", default="mixture", metavar="NAME", help="who demonstrates (default: mixture)")
+    p.add_argument(
+        "--set",
+        nargs="+",
+        default=[],
+        metavar="AGENT.FIELD=VALUE",
+        dest="settings",
+        help="settings of an agent, for instance rise.beta=0.1 or cppo@RISE-SafePanda-v0.total_steps=100000",
+    )
+    p.add_argument(
+        "--workers",
+        type=int,
+        metavar="N",
+        help="processes (default: one per core); results do not depend on it",
+    )
+    p.add_argument("--device", default="cpu", help="torch device that agents train on (default: cpu)")
+    p.add_argument("--no-videos", action="store_true", help="skip the clips")
+    p.add_argument("--out", type=Path, metavar="DIR", help="run folder (default: runs/PRESET)")
+    return p  # fmt: skip
+
+
+def parse_settings(texts: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """``AGENT.FIELD=VALUE`` texts as nested settings; values are JSON, or plain words.
+
+    Raises:
+        ValueError: a text of another form.
+    """
+    settings: dict[str, dict[str, Any]] = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        agent, dot, field = name.rpartition(".")
+        if not (equals and dot and agent and field):
+            raise ValueError(f"--set takes AGENT.FIELD=VALUE, for instance rise.beta=0.1, got {text!r}")
+        try:
+            parsed = json.loads(value)
+        except ValueError:
+            parsed = value
+        settings.setdefault(agent, {})[field] = parsed
+    return settings
+
+
+def plan_of(arguments: argparse.Namespace) -> Plan:
+    """The plan that the arguments ask for, every setting checked before any work starts."""
+    from benchmarks.jobs import check_settings
+    from rise_envs import ENVS
+
+    plan = make_plan(
+        arguments.preset,
+        parse_settings(arguments.settings),
+        agents=tuple(dict.fromkeys(arguments.agents)),
+        envs=tuple(dict.fromkeys(arguments.envs or ENVS)),
+        demos=arguments.demos,
+        episodes=arguments.episodes,
+        noise_model=arguments.noise_model,
+        noise_levels=None if arguments.noise_levels is None else tuple(sorted(set(arguments.noise_levels))),
+        seeds=arguments.seeds,
+        expert=arguments.expert,
+    )
+    check_settings(plan)
+    if arguments.workers is not None and arguments.workers < 1:
+        raise ValueError(f"--workers must be at least 1, got {arguments.workers}")
+    return plan
+
+
+def prepare_folder(out: Path) -> None:
+    """Make the run folder; raises ``ValueError`` if nothing can be written there."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        probe = out / ".writable"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise ValueError(f"cannot write to the run folder {out}: {error.strerror}") from None
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the benchmark; returns the exit code: 0 done, 1 something failed, 2 bad arguments, 130 interrupted."""
+    started = time.perf_counter()
+    try:
+        arguments = parser().parse_args(argv)
+        warnings.simplefilter("ignore", DeprecationWarning)  # of libraries; their users cannot act on them
+        plan = plan_of(arguments)
+        out = arguments.out or Path("runs") / arguments.preset
+        prepare_folder(out)
+    except ValueError as error:
+        print(f"benchmarks.run: {error}", file=sys.stderr)
+        return 2
+    from benchmarks.pipeline import execute
+    from rise_agents.workers import available_cores
+
+    workers = arguments.workers or available_cores()
+    command = ["python", "-m", "benchmarks.run", *(sys.argv[1:] if argv is None else argv)]
+    try:
+        failures = execute(plan, out, workers, arguments.device, not arguments.no_videos, command)
+    except KeyboardInterrupt:
+        print(
+            "\nbenchmarks.run: interrupted; what is finished is kept, run the command again to go on",
+            file=sys.stderr,
+        )
+        return 130
+    except (OSError, ValueError) as error:
+        print(f"benchmarks.run: {error}", file=sys.stderr)
+        return 1
+    for failure in failures:
+        print(f"benchmarks.run: failed: {failure.job.name}: {failure.reason}", file=sys.stderr)
+    print(f"{'Finished' if not failures else 'Stopped'} after {time.perf_counter() - started:.0f} s: {out}")
+    return 1 if failures else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
