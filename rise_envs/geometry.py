@@ -63,8 +63,8 @@ def swept_clearance(
 
     The time of closest approach is where the parabola through the squared distances at the step's start,
     middle and end is least; the distance there is taken on the exact arc. (The chord's time would not do: the
-    arc bulges by 5 mm, and that cost 3 mm of clearance.) The result errs upwards only: for steps of 0.25 m and
-    0.15 rad by less than 0.01 mm where the discs nearly touch, and by less than 1 mm where their centres meet
+    arc bulges by 5 mm, which can cost 3 mm of clearance.) The result errs upwards only: for steps of 0.25 m
+    and 0.15 rad by less than 0.01 mm where discs nearly touch, and by less than 1 mm where their centres meet
     (tested).
 
     Args:
