@@ -134,7 +134,9 @@ def read_rows(path: StrPath) -> pa.Table:
     try:
         content = pa.BufferReader(Path(path).read_bytes())
         table = pq.ParquetFile(content, page_checksum_verification=True).read(use_threads=False)
-    except (OSError, pa.ArrowException) as error:
+        table.validate(full=True)
+        _ = table.column_names  # decodes them, which fails where they are damaged
+    except (OSError, ValueError, pa.ArrowException) as error:
         raise ValueError(f"{path}: cannot be read as results: {error}") from None
     return check(table, str(path))
 

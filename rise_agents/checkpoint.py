@@ -56,7 +56,7 @@ def versions() -> dict[str, str]:
 
 
 def save(path: str | os.PathLike[str], arrays: Mapping[str, NDArray], description: Mapping[str, Any]) -> None:
-    """Store named ``arrays`` and a JSON-able ``description`` (keys ``agent``, ``env``, ``config`` at least)."""
+    """Store named ``arrays`` and a JSON-able ``description`` (at least ``agent``, ``env``, ``config``)."""
     header = {"schema": SCHEMA, "versions": versions(), **description}
     contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     body = st.save(contiguous, metadata={"rise": json.dumps(header, sort_keys=True)})
