@@ -13,9 +13,10 @@ import time
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from benchmarks.protocol import PRESETS, Plan, make_plan
+from rise_agents.cli import Parser
 
 _EXAMPLES = """\
 examples:
@@ -29,21 +30,12 @@ A run that was stopped continues where it was: give the same command again.
 """
 
 
-class _Parser(argparse.ArgumentParser):
-    """An argument parser whose errors are one line."""
-
-    def error(self, message: str) -> NoReturn:
-        raise ValueError(message)
-
-
-def parser() -> argparse.ArgumentParser:
+def parser() -> Parser:
     """The command line."""
-    p = _Parser(
+    p = Parser(
         prog="python -m benchmarks.run",
         description="Compare agents on noisy obstacle readings: train, evaluate, tables, figures, videos.",
         epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
     )
     p.add_argument(
         "--agents",

@@ -1,0 +1,46 @@
+# Two commands do everything: `make bench` and `make test`. Both make their own .venv first, once.
+VENV   ?= .venv
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+BIN     = $(VENV)/bin
+STAMP   = $(VENV)/.installed
+ARGS   ?=
+
+.PHONY: bench test test-slow smoke lint format clean help
+
+help:
+	@echo "make bench      install, then demonstrations, training, 1,000 noisy scenarios, tables, figures, videos"
+	@echo "make test       install, then all fast tests"
+	@echo "make test-slow  the tests that take minutes"
+	@echo "make smoke      the whole benchmark in miniature"
+	@echo "make lint       ruff and mypy"
+	@echo "Extra arguments go through ARGS, for instance: make bench ARGS='--noise-model episode'"
+
+$(STAMP): pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt torch
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	@touch $@
+
+bench: $(STAMP)
+	$(BIN)/python -m benchmarks.run --agents rise pcbc cppo $(ARGS)
+
+smoke: $(STAMP)
+	$(BIN)/python -m benchmarks.run --agents rise pcbc cppo --preset smoke $(ARGS)
+
+test: $(STAMP)
+	$(BIN)/python -m pytest -n auto $(ARGS)
+
+test-slow: $(STAMP)
+	$(BIN)/python -m pytest -m slow $(ARGS)
+
+lint: $(STAMP)
+	$(BIN)/python -m ruff check .
+	$(BIN)/python -m ruff format --check .
+	$(BIN)/python -m mypy
+
+format: $(STAMP)
+	$(BIN)/python -m ruff check --fix .
+	$(BIN)/python -m ruff format .
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache

@@ -1,0 +1,92 @@
+"""The command line of :mod:`rise_agents.demonstrations`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from rise_agents import demonstrations
+from rise_agents.agent import nearest
+from rise_agents.cli import Parser
+from rise_agents.experts import expert_names
+from rise_agents.workers import available_cores
+from rise_envs import ENVS
+
+_EXAMPLES = """\
+examples:
+  python -m rise_agents.demonstrations --env RISE-GroundVehicle-v0 --episodes 10000 --out demos/vehicle
+  python -m rise_agents.demonstrations --env RISE-SafePanda-v0 --expert cbf --episodes 500 --out demos/panda
+  python -m rise_agents.demonstrations --env RISE-GroundVehicle-v0 --out demos/vehicle --minari rise/vehicle-v0
+
+The result is the same for any number of workers.
+"""
+
+
+def parser() -> Parser:
+    """The command line."""
+    p = Parser(
+        prog="python -m rise_agents.demonstrations",
+        description="Record an expert's safe and successful episodes.",
+        epilog=_EXAMPLES,
+    )
+    p.add_argument("--env", required=True, metavar="ID", help=f"environment: {', '.join(ENVS)}")
+    p.add_argument("--expert", default="mixture", metavar="NAME", help="who demonstrates (default: mixture)")
+    p.add_argument("--episodes", type=int, default=1000, metavar="N", help="episodes to keep (default: 1000)")
+    p.add_argument("--seed", type=int, default=0, metavar="N", help="range of training seeds (default: 0)")
+    p.add_argument("--workers", type=int, default=None, metavar="N", help="processes (default: one per core)")
+    p.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write")
+    p.add_argument("--minari", metavar="ID", help="also export to the local Minari store under this id")
+    return p
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Record demonstrations; returns the exit code: 0 done, 1 failed, 2 bad arguments, 130 interrupted."""
+    console = Console(stderr=True)
+    try:
+        a = parser().parse_args(argv)
+        if a.env not in ENVS:
+            raise ValueError(f"unknown environment {a.env!r}: {nearest(a.env, ENVS)}")
+        if a.expert not in expert_names(a.env):
+            raise ValueError(f"unknown expert {a.expert!r}: {nearest(a.expert, expert_names(a.env))}")
+        for name in ("episodes", "workers"):
+            if getattr(a, name) is not None and getattr(a, name) < 1:
+                raise ValueError(f"--{name} must be at least 1, got {getattr(a, name)}")
+        if (a.out / demonstrations.CARD).exists():
+            raise ValueError(f"{a.out} holds a demonstration set already: name another folder or remove it")
+        a.out.mkdir(parents=True, exist_ok=True)
+    except (ValueError, OSError) as error:
+        print(f"rise_agents.demonstrations: {error}", file=sys.stderr)
+        return 2
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    try:
+        with Progress(*columns, console=console, disable=not console.is_terminal) as bars:
+            bar = bars.add_task(f"{a.expert} on {a.env}", total=a.episodes)
+            made = demonstrations.generate(
+                a.env,
+                a.expert,
+                a.episodes,
+                a.seed,
+                a.workers or available_cores(),
+                finished=lambda kept, tried: bars.update(bar, completed=kept),
+            )
+        made.save(a.out)
+        if a.minari:
+            from rise_agents.minari_io import export
+
+            export(made, a.minari)
+    except KeyboardInterrupt:
+        print("\nrise_agents.demonstrations: interrupted, nothing was written", file=sys.stderr)
+        return 130
+    except (ValueError, OSError) as error:
+        print(f"rise_agents.demonstrations: {error}", file=sys.stderr)
+        return 1
+    card = made.card
+    print(
+        f"{card['episodes']:,} episodes, {card['transitions']:,} transitions in {a.out}; "
+        f"{card['tried']:,} tried, {100 * card['rejection_rate']:.2f} % rejected as unsafe or unsuccessful"
+    )
+    return 0
