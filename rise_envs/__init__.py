@@ -8,6 +8,24 @@ from __future__ import annotations
 
 import gymnasium as gym
 
+from rise_envs.cost import CostFromTuple, CostToTuple, RequireCost, cost_of
+from rise_envs.noise import NOISE_MODELS, make_noise
+from rise_envs.noise_models import NoiseModel
+from rise_envs.noise_wrappers import ObservationNoise, VectorObservationNoise
+
+__all__ = [
+    "ENVS",
+    "NOISE_MODELS",
+    "CostFromTuple",
+    "CostToTuple",
+    "NoiseModel",
+    "ObservationNoise",
+    "RequireCost",
+    "VectorObservationNoise",
+    "cost_of",
+    "make_noise",
+]
+
 # id -> (entry point, vector entry point, steps per episode). A new environment is one file and one line here.
 ENVS: dict[str, tuple[str, str | None, int]] = {
     "RISE-GroundVehicle-v0": (

@@ -77,8 +77,9 @@ def make_noise(noise: str | NoiseModel, level: float = 1.0) -> NoiseModel:
         noise = models[0] if len(models) == 1 else Compose(tuple(models))
     if not isinstance(noise, NoiseModel):
         raise ValueError(f"noise must be a NoiseModel or a text such as 'step+dropout:0.3', got {noise!r}")
-    # Without parts rather than with zeros in them: this leaves even the sign of −0.0 as it was.
-    return noise.at(level) if level > 0 else Compose(())
+    if level == 0:
+        return Compose(())  # rather than a model of amplitude 0: this keeps even the sign of −0.0
+    return noise if level == 1 else noise.at(level)
 
 
 def _make_part(text: str, whole: str) -> NoiseModel:
