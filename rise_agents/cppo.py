@@ -1,0 +1,334 @@
+"""C-PPO: proximal policy optimisation under a cost limit, trained in the environment.
+
+PPO (Schulman et al. 2017) of stable-baselines3 with the PID-controlled Lagrange multiplier of Stooke, Achiam
+and Abbeel (2020), see :mod:`rise_agents.lagrangian`. It is the baseline that learns by trial: from millions
+of steps in the environment instead of demonstrations, with ``info["cost"]`` kept below a limit per episode.
+Any Gymnasium environment with that cost will do (``frame="raw"``).
+
+Shapes: B batch, K network inputs, A action dimensions.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from gymnasium import spaces
+from gymnasium.vector import VectorEnv
+from numpy.typing import NDArray
+from stable_baselines3.common.logger import Logger
+
+from rise_agents import checkpoint, readings
+from rise_agents.actor import Actor
+from rise_agents.agent import Progress, State, config_from_dict, config_to_dict, nearest, require, silent
+from rise_agents.lagrangian import ConstrainedPPO, Controller
+from rise_agents.seeds import episode_seeds
+from rise_agents.vec_env import (
+    Bridge,
+    action_bounds,
+    as_vector_env,
+    make_training_env,
+    random_inputs,
+)
+from rise_envs import streams
+from rise_envs.task import Task, task_of
+
+FRAMES = (*readings.FRAMES, "raw")
+_STATISTICS_SAMPLES = 4096  # observations that the units of the inputs are taken from
+_ACTING = 0xC990  # tag of the stream that exploration draws from when the caller gives none
+
+
+@dataclass(frozen=True)
+class Config:
+    """Settings of C-PPO.
+
+    Attributes:
+        frame: what the policy sees: ``world``, ``body`` or ``features`` of a RISE task, or ``raw``: the
+            flattened observation of any environment.
+        total_steps: environment steps to train for.
+        n_envs: environments side by side.
+        n_steps: steps of each environment between two updates.
+        batch_size: of a gradient step.
+        n_epochs: passes over a roll-out.
+        learning_rate: of all networks at the start.
+        final_learning_rate: at the end; linear in between.
+        gamma: discount of rewards.
+        gae_lambda: of the advantage of rewards.
+        cost_gamma: discount of costs.
+        cost_gae_lambda: of the advantage of costs.
+        clip_range: of the policy's probability ratio.
+        entropy_coef: weight of the policy's entropy.
+        max_grad_norm: gradients are clipped to this norm.
+        hidden: widths of policy, value and cost networks.
+        log_std: logarithm of the policy's standard deviation at the start, with actions in [−1, 1].
+        cost_limit: mean undiscounted cost of an episode that is allowed.
+        kp: proportional gain of the multiplier's controller.
+        ki: integral gain.
+        kd: derivative gain.
+        pid_delay: updates that the derivative looks back.
+        pid_smoothing: share of the past in the running mean cost.
+        lambda_init: the multiplier at the start.
+    """
+
+    frame: str = "body"
+    total_steps: int = 1_000_000
+    n_envs: int = 16
+    n_steps: int = 128
+    batch_size: int = 512
+    n_epochs: int = 10
+    learning_rate: float = 3e-4
+    final_learning_rate: float = 3e-5
+    gamma: float = 0.99
+    gae_lambda: float = 0.95
+    cost_gamma: float = 0.99
+    cost_gae_lambda: float = 0.95
+    clip_range: float = 0.2
+    entropy_coef: float = 0.0
+    max_grad_norm: float = 0.5
+    hidden: tuple[int, ...] = (64, 64)
+    log_std: float = -0.5
+    cost_limit: float = 0.1
+    kp: float = 0.1
+    ki: float = 0.01
+    kd: float = 0.01
+    pid_delay: int = 10
+    pid_smoothing: float = 0.9
+    lambda_init: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.frame not in FRAMES:
+            raise ValueError(f"unknown frame {self.frame!r}: {nearest(str(self.frame), FRAMES)}")
+        for name in ("total_steps", "n_envs", "n_steps", "batch_size", "n_epochs", "pid_delay"):
+            value = getattr(self, name)
+            require(
+                isinstance(value, int) and value >= 1, f"{name} must be a whole number of at least 1", value
+            )
+        for name in ("gamma", "gae_lambda", "cost_gamma", "cost_gae_lambda"):
+            require(0 <= getattr(self, name) <= 1, f"{name} must lie in [0, 1]", getattr(self, name))
+        for name in ("learning_rate", "clip_range", "max_grad_norm"):
+            value = getattr(self, name)
+            require(0 < value < np.inf, f"{name} must be positive and finite", value)
+        for name in ("final_learning_rate", "entropy_coef", "cost_limit", "kp", "ki", "kd", "lambda_init"):
+            value = getattr(self, name)
+            require(0 <= value < np.inf, f"{name} must be finite and not negative", value)
+        require(0 <= self.pid_smoothing < 1, "pid_smoothing must lie in [0, 1)", self.pid_smoothing)
+        require(np.isfinite(self.log_std), "log_std must be finite", self.log_std)
+        fits = bool(self.hidden) and all(isinstance(width, int) and width >= 1 for width in self.hidden)
+        require(fits, "hidden must be widths of at least 1", self.hidden)
+        self.check_batch(self.n_envs)
+
+    def check_batch(self, n_envs: int) -> None:
+        """Raise ``ValueError`` if a roll-out of ``n_envs`` environments cannot be cut into equal batches."""
+        size = n_envs * self.n_steps
+        fits = size % self.batch_size == 0
+        require(fits, f"batch_size must divide n_envs · n_steps = {n_envs} · {self.n_steps}", self.batch_size)
+
+    def controller(self) -> Controller:
+        """The multiplier's controller at the start of training."""
+        return Controller(
+            *(self.cost_limit, self.kp, self.ki, self.kd, self.pid_delay, self.pid_smoothing),
+            integral=self.lambda_init,
+            multiplier=self.lambda_init,
+        )
+
+
+# Settings that differ from the defaults because they were found to serve an environment better.
+PRESETS: dict[str, dict[str, Any]] = {}
+
+
+class CPPO:
+    """An agent that learns by constrained PPO; see the module's docstring.
+
+    Args:
+        env_id: a registered environment.
+        config: settings that differ from the environment's preset, by the names of :class:`Config`.
+        seed: of weights, exploration, batches and training episodes.
+        device: a torch device for training; ``predict`` runs in NumPy.
+
+    Raises:
+        ValueError: an unknown setting, one out of range, or a frame that the environment does not offer.
+    """
+
+    Config = Config
+    PRESETS = PRESETS
+    learns_from = "environment"
+    evaluate_deterministic = True
+
+    def __init__(
+        self, env_id: str, config: dict[str, Any] | None = None, seed: int = 0, device: str = "cpu"
+    ) -> None:
+        self.env_id, self.seed, self.device = env_id, seed, device
+        self.config: Config = config_from_dict(Config, {**PRESETS.get(env_id, {}), **(config or {})})
+        self._task = self._describe()
+        self._stream = streams.key_from_seed(seed, _ACTING)
+        self._arrays: dict[str, NDArray] = {}  # what training left behind, in the form that is stored
+        self._notes: dict[str, Any] = {}
+        self._actor: Actor | None = None
+
+    def _describe(self) -> Task | None:
+        if self.config.frame == "raw":
+            return None
+        try:
+            return task_of(self.env_id)
+        except ValueError as error:
+            raise ValueError(f"{error}, or choose frame='raw'") from None
+
+    def learn(self, source: str | gym.Env | VectorEnv | None = None, progress: Progress = silent) -> CPPO:
+        """Train in ``source``: an environment id (default: the agent's own) or a ready environment.
+
+        ``progress`` is told, after every update, ``steps``, ``lambda``, and of the last 100 episodes the mean
+        ``return`` and ``cost``.
+
+        Raises:
+            ValueError: an environment without costs, with unbounded actions, with observations that the frame
+                cannot read, or a vector environment in another autoreset mode than SAME_STEP.
+        """
+        if source is not None and not isinstance(source, str):
+            return self._learn(as_vector_env(source), progress)
+        venv = make_training_env(source or self.env_id, self.config.n_envs)
+        try:
+            return self._learn(venv, progress)
+        finally:
+            venv.close()
+
+    def _learn(self, venv: VectorEnv, progress: Progress) -> CPPO:
+        c, bounds = self.config, action_bounds(venv.single_action_space)
+        ranks = self._ranks(venv.single_observation_space)
+        c.check_batch(venv.num_envs)
+        seeds = episode_seeds("train", self.seed, 0, venv.num_envs)
+        units = readings.Standardiser.fit(random_inputs(venv, self._inputs, seeds, _STATISTICS_SAMPLES))
+        bridge = Bridge(venv, lambda observation: units(self._inputs(observation)), len(units.mean))
+        with _one_thread():
+            ppo = ConstrainedPPO(
+                controller=c.controller(),
+                cost_gamma=c.cost_gamma,
+                cost_gae_lambda=c.cost_gae_lambda,
+                cost_hidden=c.hidden,
+                report=progress,
+                env=bridge,
+                learning_rate=_linear(c.learning_rate, c.final_learning_rate),
+                n_steps=c.n_steps,
+                batch_size=c.batch_size,
+                n_epochs=c.n_epochs,
+                gamma=c.gamma,
+                gae_lambda=c.gae_lambda,
+                clip_range=c.clip_range,
+                ent_coef=c.entropy_coef,
+                max_grad_norm=c.max_grad_norm,
+                policy_kwargs={"net_arch": list(c.hidden), "log_std_init": c.log_std},
+                seed=self.seed,
+                device=self.device,
+            )
+            ppo.set_logger(Logger(folder=None, output_formats=[]))  # SB3's own makes a folder
+            ppo.learn(c.total_steps, log_interval=None)  # type: ignore[arg-type]  # None: nothing to log
+        self._arrays, self._notes = ppo.snapshot()
+        self._arrays |= units.arrays("units")
+        if bounds is not None:
+            self._arrays |= {"action.low": bounds[0], "action.high": bounds[1]}
+        self._notes["ranks"] = ranks
+        self._actor = Actor(self._arrays)
+        return self
+
+    def _ranks(self, space: spaces.Space) -> dict[str, int]:
+        """Number of dimensions of each part of one observation; refuses what the frame cannot read."""
+        parts = space.spaces if isinstance(space, spaces.Dict) else {"": space}
+        for key, part in parts.items():
+            if not isinstance(part, spaces.Box):
+                raise ValueError(f"observation {key!r} must be a Box to be read as numbers, got {part}")
+        if self._task is not None:
+            given, known = parts["obstacle"].shape, (len(self._task.noise_scale),)
+            if given != known:
+                raise ValueError(f"observation 'obstacle' of {self.env_id!r} has shape {known}, got {given}")
+        return {key: len(part.shape or ()) for key, part in parts.items()}
+
+    def _inputs(self, observation: Any) -> NDArray[np.float64]:
+        """Network inputs (B, K) of a batched observation, in the environment's units."""
+        if self._task is not None:
+            return np.concatenate(readings.inputs(self._task, self.config.frame, observation), -1)
+        parts = observation if isinstance(observation, dict) else {"": observation}
+        flat = [np.asarray(parts[key], np.float64).reshape(len(parts[key]), -1) for key in sorted(parts)]
+        return np.concatenate(flat, -1)
+
+    def initial_state(self, keys: NDArray[np.uint64]) -> tuple[NDArray[np.uint64], NDArray[np.uint64]]:
+        """Random streams of the episodes with these keys (B,): each row a key and how often it drew."""
+        return np.asarray(keys, np.uint64), np.zeros(len(keys), np.uint64)
+
+    def predict(
+        self,
+        observation: Any,
+        state: State = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray, State]:
+        """Actions inside the bounds for one observation or a batch.
+
+        Args:
+            observation: the environment's, single or with a leading batch dimension.
+            state: what the last call returned, or :meth:`initial_state`; None starts the agent's own streams.
+            episode_start: (B,), rows that begin an episode: those that drew before go on to a new stream.
+            deterministic: the mean (or likeliest) action instead of a draw from the policy.
+
+        Returns:
+            Actions, float32 (int64 for discrete ones), and the state for the next call.
+
+        Raises:
+            RuntimeError: the agent has learned nothing yet.
+        """
+        if self._actor is None:
+            raise RuntimeError("this C-PPO agent is untrained: call learn() or load a checkpoint first")
+        parts = observation if isinstance(observation, dict) else {"": observation}
+        single = all(np.ndim(parts[key]) == rank for key, rank in self._notes["ranks"].items())
+        if single:
+            parts = {key: np.asarray(part)[None] for key, part in parts.items()}
+        output = self._actor.output(self._inputs(parts))
+        if not deterministic:
+            keys, counter = state or self.initial_state(streams.bits(self._stream, np.arange(len(output))))
+            if episode_start is not None:
+                again = np.asarray(episode_start, bool) & (counter > 0)
+                keys, counter = np.where(again, streams.split(keys, 1), keys), np.where(again, 0, counter)
+            output = self._actor.explore(output, keys, counter)
+            state = keys, counter + np.uint64(1)
+        action = self._actor.action(output)
+        return (action[0] if single else action), state
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Store all that acting and continued training need; :func:`rise_agents.load_agent` reads it.
+
+        Raises:
+            RuntimeError: the agent has learned nothing yet.
+        """
+        if self._actor is None:
+            raise RuntimeError("this C-PPO agent is untrained: call learn() before save()")
+        description = {"agent": "cppo", "env": self.env_id, "seed": self.seed, "notes": self._notes}
+        checkpoint.save(path, self._arrays, {**description, "config": config_to_dict(self.config)})
+
+    @classmethod
+    def from_checkpoint(
+        cls, arrays: dict[str, NDArray], description: dict[str, Any], device: str = "cpu"
+    ) -> CPPO:
+        """The agent that :meth:`save` stored."""
+        agent = cls(description["env"], description["config"], description["seed"], device)
+        agent._arrays, agent._notes = arrays, description["notes"]
+        agent._actor = Actor(arrays)
+        return agent
+
+
+def _linear(first: float, last: float) -> Callable[[float], float]:
+    return lambda remaining: last + (first - last) * remaining
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Networks this small lose time to a second thread; and one thread sums in one order."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
