@@ -12,11 +12,12 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import DictInfoToList
 from numpy.testing import assert_array_equal, assert_equal
 
-import rise_envs  # noqa: F401  registers the environments
+import rise_envs
 from rise_envs import streams
 from rise_envs.noise import corrupt
 from rise_envs.noise_models import EpisodeBias, StepNoise
 from rise_envs.noise_wrappers import ObservationNoise, VectorObservationNoise
+from rise_envs.task import task_of
 
 MODES = list(AutoresetMode)
 MODELS = ["step", "episode", "step+dropout:0.4+delay:2", "drift:1+quantise:0.3"]
@@ -210,6 +211,12 @@ def test_spaces():
     for each in (env, ObservationNoise(BoxWalk()), ObservationNoise(vehicle())):
         assert each.observation_space.contains(each.reset(seed=0)[0])
         assert each.observation_space.contains(each.step(each.action_space.sample())[0])
+
+
+@pytest.mark.parametrize("env_id", rise_envs.ENVS)
+def test_every_environment_publishes_the_scale_of_its_task(env_id):
+    with gym.make(env_id) as env:
+        assert_array_equal(ObservationNoise(env)._rows.scale, task_of(env_id).noise_scale)
 
 
 def test_the_published_scale_is_used_or_1():
