@@ -69,7 +69,9 @@ _CAPSULE_TABLE = np.array(
     ]
 )
 CAPSULE_FRAME = _CAPSULE_TABLE[:, 0].astype(np.int64)  # (K,)
-CAPSULE_ENDS = np.ascontiguousarray(_CAPSULE_TABLE[:, 1:7].reshape(-1, 2, 3))
+CAPSULE_START = np.ascontiguousarray(_CAPSULE_TABLE[:, 1:4])  # in the frame (m), (K, 3)
+CAPSULE_EDGE = np.ascontiguousarray(_CAPSULE_TABLE[:, 4:7]) - CAPSULE_START  # from there to the other end
+_INVERSE_SQUARE = 1.0 / (CAPSULE_EDGE**2).sum(1)
 CAPSULE_RADIUS = np.ascontiguousarray(_CAPSULE_TABLE[:, 7])
 N_CAPSULES = len(CAPSULE_FRAME)
 
@@ -167,7 +169,7 @@ def write_damped_map(jacobian: Array, damping: float, work: Array, mapping: Arra
 
 
 @njit(cache=True)
-def write_distances(rotation: Array, position: Array, center: Array, distance: Array, nearest: Array) -> None:
+def write_distances(rotation: Array, position: Array, center: Array, distance: Array, share: Array) -> None:
     """Signed distance of a point to every capsule, in place.
 
     Args:
@@ -175,31 +177,23 @@ def write_distances(rotation: Array, position: Array, center: Array, distance: A
         position: (9, 3) of `write_frames`.
         center: the point (m), (3,); a sphere's radius is for the caller to subtract.
         distance: receives the distances to the capsules' surfaces (m), (K,).
-        nearest: receives the nearest points of the capsules' axes (m), (K, 3).
+        share: receives where on the capsules' axes the nearest points are, from 0 to 1, (K,).
     """
-    local = np.empty(3)
+    frame, x, y, z = -1, 0.0, 0.0, 0.0
     for k in range(N_CAPSULES):
-        frame = CAPSULE_FRAME[k]
-        for c in range(3):
-            local[c] = 0.0
-            for r in range(3):
-                local[c] += rotation[frame, r, c] * (center[r] - position[frame, r])
-        along, square = 0.0, 1e-12
-        for c in range(3):
-            edge = CAPSULE_ENDS[k, 1, c] - CAPSULE_ENDS[k, 0, c]
-            along += edge * (local[c] - CAPSULE_ENDS[k, 0, c])
-            square += edge * edge
-        share = min(1.0, max(0.0, along / square))
-        gap = 0.0
-        for c in range(3):
-            at = CAPSULE_ENDS[k, 0, c] + share * (CAPSULE_ENDS[k, 1, c] - CAPSULE_ENDS[k, 0, c])
-            gap += (local[c] - at) ** 2
-            local[c] = at
-        distance[k] = np.sqrt(gap) - CAPSULE_RADIUS[k]
-        for r in range(3):
-            nearest[k, r] = position[frame, r]
-            for c in range(3):
-                nearest[k, r] += rotation[frame, r, c] * local[c]
+        if CAPSULE_FRAME[k] != frame:  # the capsules are sorted: turn the point into each frame once
+            frame = CAPSULE_FRAME[k]
+            dx, dy = center[0] - position[frame, 0], center[1] - position[frame, 1]
+            dz = center[2] - position[frame, 2]
+            x = rotation[frame, 0, 0] * dx + rotation[frame, 1, 0] * dy + rotation[frame, 2, 0] * dz
+            y = rotation[frame, 0, 1] * dx + rotation[frame, 1, 1] * dy + rotation[frame, 2, 1] * dz
+            z = rotation[frame, 0, 2] * dx + rotation[frame, 1, 2] * dy + rotation[frame, 2, 2] * dz
+        gx, gy, gz = x - CAPSULE_START[k, 0], y - CAPSULE_START[k, 1], z - CAPSULE_START[k, 2]
+        ex, ey, ez = CAPSULE_EDGE[k, 0], CAPSULE_EDGE[k, 1], CAPSULE_EDGE[k, 2]
+        t = min(1.0, max(0.0, (ex * gx + ey * gy + ez * gz) * _INVERSE_SQUARE[k]))
+        gx, gy, gz = gx - t * ex, gy - t * ey, gz - t * ez
+        distance[k] = np.sqrt(gx * gx + gy * gy + gz * gz) - CAPSULE_RADIUS[k]
+        share[k] = t
 
 
 @njit(cache=True)
@@ -213,10 +207,10 @@ def _hands(q: Array, hands: Array) -> None:
 @njit(cache=True)
 def _clearances(q: Array, center: Array, radius: Array, least: Array, capsule: NDArray[np.int64]) -> None:
     rotation, position = np.empty((N_FRAMES, 3, 3)), np.empty((N_FRAMES, 3))
-    distance, nearest = np.empty(N_CAPSULES), np.empty((N_CAPSULES, 3))
+    distance, share = np.empty(N_CAPSULES), np.empty(N_CAPSULES)
     for b in range(len(q)):
         write_frames(q[b], rotation, position)
-        write_distances(rotation, position, center[b], distance, nearest)
+        write_distances(rotation, position, center[b], distance, share)
         capsule[b] = np.argmin(distance)
         least[b] = distance[capsule[b]] - radius[b]
 

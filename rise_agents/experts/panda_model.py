@@ -41,7 +41,7 @@ class Arm(NamedTuple):
     work: Array  # (6, 6)
     mapping: Array  # damped inverse of the Jacobian, (7, 6)
     distance: Array  # of the capsules to the sphere's centre (m), (K,)
-    nearest: Array  # points of their axes nearest to it (m), (K, 3)
+    share: Array  # where on their axes the nearest points are, from 0 to 1, (K,)
 
 
 class Scene(NamedTuple):
@@ -64,7 +64,7 @@ def make_arm() -> Arm:
         np.empty((6, 6)),
         np.empty((panda.N_JOINTS, 6)),
         np.empty(panda.N_CAPSULES),
-        np.empty((panda.N_CAPSULES, 3)),
+        np.empty(panda.N_CAPSULES),
     )
 
 
@@ -75,7 +75,7 @@ def look(q: Array, center: Array, arm: Arm) -> None:
     panda.write_hand(arm.rotation, arm.position, arm.hand)
     panda.write_jacobian(arm.rotation, arm.position, arm.hand, arm.jacobian)
     panda.write_damped_map(arm.jacobian, _DAMPING, arm.work, arm.mapping)
-    panda.write_distances(arm.rotation, arm.position, center, arm.distance, arm.nearest)
+    panda.write_distances(arm.rotation, arm.position, center, arm.distance, arm.share)
 
 
 @njit(cache=True)
@@ -114,14 +114,18 @@ def write_gradient(k: int, center: Array, arm: Arm, normal: Array, gradient: Arr
         normal: receives the unit vector from the sphere to the capsule, (3,).
         gradient: receives d(distance)/d(displacement of the hand, its orientation held), (3,).
     """
-    length = arm.distance[k] + panda.CAPSULE_RADIUS[k] + 1e-9
-    for r in range(3):
-        normal[r] = (arm.nearest[k, r] - center[r]) / length
+    frame, length = panda.CAPSULE_FRAME[k], arm.distance[k] + panda.CAPSULE_RADIUS[k] + 1e-9
+    for r in range(3):  # first the nearest point of the capsule's axis
+        normal[r] = arm.position[frame, r]
+        for c in range(3):
+            local = panda.CAPSULE_START[k, c] + arm.share[k] * panda.CAPSULE_EDGE[k, c]
+            normal[r] += arm.rotation[frame, r, c] * local
         gradient[r] = 0.0
-    for i in range(min(panda.CAPSULE_FRAME[k], panda.N_JOINTS)):
-        dx = arm.nearest[k, 0] - arm.position[i + 1, 0]
-        dy = arm.nearest[k, 1] - arm.position[i + 1, 1]
-        dz = arm.nearest[k, 2] - arm.position[i + 1, 2]
+    x, y, z = normal[0], normal[1], normal[2]
+    for r in range(3):
+        normal[r] = (normal[r] - center[r]) / length
+    for i in range(min(frame, panda.N_JOINTS)):
+        dx, dy, dz = x - arm.position[i + 1, 0], y - arm.position[i + 1, 1], z - arm.position[i + 1, 2]
         ax, ay, az = arm.rotation[i + 1, 0, 2], arm.rotation[i + 1, 1, 2], arm.rotation[i + 1, 2, 2]
         along = normal[0] * (ay * dz - az * dy) + normal[1] * (az * dx - ax * dz)
         along += normal[2] * (ax * dy - ay * dx)

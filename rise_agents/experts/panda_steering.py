@@ -1,10 +1,10 @@
 """How the Panda's experts steer: a barrier QP, and the side on which to pass the sphere.
 
-The controller `steer` is a quadratic program with control barrier functions (Ames et al., IEEE TAC 2017) in the
-three components of the action. It stays as close to a wanted action as the barriers of every capsule, of the
-table and of the arm's reach allow. For a capsule at distance d from the sphere the barrier asks that d − margin
-be at least (1 − decay)·(d − margin) after the step. The wanted action heads for the goal and, near the sphere,
-along the sphere's surface.
+The controller `steer` is a quadratic program with control barrier functions (Ames et al., IEEE TAC 2017) in
+the three components of the action. It stays as close to a wanted action as the barriers of every capsule, of
+the table and of the arm's reach allow. For a capsule at distance d from the sphere the barrier asks that
+d − margin be at least (1 − decay)·(d − margin) after the step. The wanted action heads for the goal and, near
+the sphere, along the sphere's surface.
 
 On which side is decided by `choose_side`: roll-outs of `steer` itself on the motion model, one per side, with
 a bonus for the side already taken. Both experts follow that choice, so that they agree on it.
@@ -87,7 +87,9 @@ def _add_row(n: int, gradient: Array, drift: float, least: float, price: float, 
         )
         square += rows[n, r] ** 2
     length = np.sqrt(square)
-    if length < 1e-3 * STEP:  # the action does not move this capsule
+    # The least that any action in the box gives is enough, or no action changes anything: no row is needed.
+    slack = drift - least - abs(rows[n, 0]) - abs(rows[n, 1]) - abs(rows[n, 2])
+    if slack > 0.0 or length < 1e-3 * STEP:
         return n
     for r in range(3):
         rows[n, r] /= length
@@ -135,7 +137,7 @@ def write_wanted(scene: Scene, side: Array, t: Steering, arm: Arm, wanted: Array
     speed = min(1.0, away / t.slow_down)
     for r in range(3):
         wanted[r] *= speed / away
-    k = np.argmin(arm.distance)
+    k = int(np.argmin(arm.distance))
     near = (t.turn_far - (arm.distance[k] - scene.radius)) / (t.turn_far - t.turn_near)
     if near <= 0.0 or _dot(side, side) == 0.0:
         return
@@ -243,17 +245,18 @@ def choose_side(
     arm: Arm,
     program: Program,
     actions: Array,
-) -> None:
+) -> bool:
     """Replace ``side`` (3,) by the one with the cheapest roll-out; ``actions`` (horizon, 3) receives that.
 
     Compared are no side, the present one (with a bonus), and directions around the way to the goal. While the
-    straight way keeps clear of the sphere, there is nothing to choose.
+    straight way keeps clear of the sphere, there is nothing to choose: then it returns True.
     """
     trial, sides = np.empty_like(actions), np.zeros((N_SIDES + 2, 3))
     look(q, scene.center, arm)
     write_sides(arm.hand, scene.goal, sides[2:])
-    sides[1] = side
-    best, chosen = np.inf, 0
+    for r in range(3):
+        sides[1, r] = side[r]
+    best, chosen, clear = np.inf, 0, False
     for i in range(N_SIDES + 2):
         if i == 1 and _dot(side, side) == 0.0:
             continue
@@ -261,7 +264,12 @@ def choose_side(
         price -= t.stay if i == 1 else 0.0
         if price < best:
             best, chosen = price, i
-            actions[:] = trial
-        if i == 0 and least > t.turn_far:
+            for step in range(len(actions)):
+                for r in range(3):
+                    actions[step, r] = trial[step, r]
+        clear = i == 0 and least > t.turn_far
+        if clear:
             break
-    side[:] = sides[chosen]
+    for r in range(3):
+        side[r] = sides[chosen, r]
+    return clear
