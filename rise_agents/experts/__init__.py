@@ -51,4 +51,8 @@ def make_expert(name: str, env_id: str, seed: int = 0, **kwargs: Any) -> Any:
     if name not in names:
         raise ValueError(f"no expert {name!r} for {env_id}; {nearest(name, names)}")
     module, _, cls = EXPERTS[env_id, name].partition(":")
-    return getattr(importlib.import_module(module), cls)(task_of(env_id, **kwargs), seed=seed)
+    kind = getattr(importlib.import_module(module), cls)
+    # A mixture lists the experts that it draws from.
+    experts = [make_expert(member, env_id, seed, **kwargs) for member in getattr(kind, "names", ())]
+    given = {"experts": experts} if experts else {}
+    return kind(task_of(env_id, **kwargs), seed=seed, **given)

@@ -6,8 +6,8 @@ In the plane the optimum is the target itself, its projection on one constraint 
 them. With M constraints these are 1 + K + K(K − 1)/2 points, K = M + 4: few enough to try them all, for
 every row of a batch at once and with nothing iterative that could fail.
 
-Where the constraints contradict each other, :func:`nearest_point` keeps the box and takes the point whose worst
-violation is least (and, among those, the one nearest to the target).
+Where the constraints contradict each other, :func:`nearest_point` keeps the box and takes the point whose
+worst violation is least (and, among those, the one nearest to the target).
 
 Shapes: B batch, M constraints, K lines, P candidate points.
 """
@@ -40,7 +40,7 @@ def nearest_point(
         solved on its own: it does not depend on the rest of the batch.
     """
     point = np.clip(target, low, high)
-    feasible = (_slack(point[:, None], normals, offsets) >= 0).all((1, 2))
+    feasible: NDArray[np.bool_] = np.all(_slack(point[:, None], normals, offsets) >= 0, axis=(1, 2))
     # Most rows end here: projecting on the box is exact as long as it breaks no constraint.
     rows = np.flatnonzero(~feasible)
     if rows.size:
@@ -74,7 +74,7 @@ def _best_candidate(
     onto = target[:, None] - _slack(target[:, None], lines, levels)[:, 0, :, None] * lines
     points = np.concatenate((target[:, None], onto, _corners(lines, levels)), 1)  # (B, P, 2)
     tolerance = _TOLERANCE * (1.0 + np.abs(levels))[:, None]
-    holds = (_slack(points, lines, levels) >= -tolerance).all(-1)
+    holds: NDArray[np.bool_] = np.all(_slack(points, lines, levels) >= -tolerance, axis=-1)
     distance = np.where(holds, ((points - target[:, None]) ** 2).sum(-1), np.inf)
     best = distance.argmin(1)
     row = np.arange(batch)

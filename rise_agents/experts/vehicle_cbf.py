@@ -5,18 +5,20 @@ The point p = q + l·(cos θ, sin θ), l metres ahead of the vehicle's centre q,
     ṗ = v·e + l·ω·e⊥,       e = (cos θ, sin θ),  e⊥ = (−sin θ, cos θ),
 
 so it can be driven in any direction, which the centre cannot. A disc of radius (vehicle radius + l) about p
-covers the vehicle; for each moving disc (o, v_o, r) the distance h = |p − o| − r − (vehicle radius + l) − margin
-is a control barrier function, and its condition ḣ ≥ −γ·h is linear in the action:
+covers the vehicle. So for each moving disc (o, v_o, r) the distance
+
+    h = |p − o| − r − (vehicle radius + l) − margin
+
+is a control barrier function, whose condition ḣ ≥ −γ·h is linear in the action:
 
     n·(v·e + l·ω·e⊥) ≥ n·v_o − γ·h,       n = (p − o) / |p − o|.
 
 The action is the point of the action box nearest to a nominal one, which follows the field of
-:mod:`~rise_agents.experts.vehicle_guidance`, under these constraints (a quadratic program, solved exactly); where
-they contradict each other or the box, the one whose worst violation is least.
+:mod:`~rise_agents.experts.vehicle_guidance`, under these constraints (a quadratic program, solved exactly).
+Where they contradict each other or the box, it is the one whose worst violation is least.
 
-Sources: Ames, Xu, Grizzle & Tabuada, "Control barrier function based quadratic programs for safety critical
-systems", IEEE TAC 2017; the look-ahead point: Glotfelter, Cortés & Egerstedt, "Nonsmooth barrier functions with
-applications to multi-robot systems", IEEE L-CSS 2017.
+Source: Ames, Xu, Grizzle & Tabuada, "Control barrier function based quadratic programs for safety critical
+systems", IEEE Transactions on Automatic Control 62(8), 2017.
 """
 
 from __future__ import annotations
@@ -90,31 +92,32 @@ class VehicleCBF:
     ) -> tuple[Array, None]:
         """Actions (v, ω), (2,) or (B, 2), and None: the expert keeps no state."""
         rows, single = as_batch(observation)
-        action = self.filter(rows, self.nominal(rows))
+        state, discs = rows["observation"], self.read(rows)
+        action = self.filtered(state, discs, self.nominal(state, rows["desired_goal"], discs))
         return (action[0] if single else action), None
 
-    def discs(self, rows: Mapping[str, Array]) -> Discs:
-        """The discs of a batch of observations."""
+    def read(self, rows: Mapping[str, Array]) -> Discs:
+        """The discs that a batch of observations speaks of."""
         return Discs.read(*self.task.split(rows["obstacle"]), self.task.robot_radius)
 
-    def nominal(self, rows: Mapping[str, Array]) -> Array:
-        """Actions (B, 2) that follow the field without regard to the barrier."""
-        position, rotation = self.task.pose(rows["observation"])
-        wanted = direction(position, rows["desired_goal"], self.discs(rows), self.config.guidance)
+    def nominal(self, state: Array, goal: Array, discs: Discs) -> Array:
+        """Actions (B, 2) that follow the field from states (B, 3) to goals (B, 2), without the barrier."""
+        position, rotation = self.task.pose(state)
+        wanted = direction(position, goal, discs, self.config.guidance)
         forward, left = dot(wanted, rotation[..., 0]), dot(wanted, rotation[..., 1])
         v = self.high[0] * np.maximum(forward, self.config.slowest)
         omega = self.config.turn_gain * np.arctan2(left, forward)
         return np.clip(np.stack((v, omega), -1), self.low, self.high)
 
-    def filter(self, rows: Mapping[str, Array], nominal: Array) -> Array:
-        """The safe action nearest to the nominal one, (B, 2): the quadratic program of this module."""
-        c, discs = self.config, self.discs(rows)
-        position, rotation = self.task.pose(rows["observation"])
+    def filtered(self, state: Array, discs: Discs, nominal: Array) -> Array:
+        """The safe actions nearest to the nominal ones (B, 2): the quadratic program of this module."""
+        c = self.config
+        position, rotation = self.task.pose(state)
         ahead, aside = rotation[..., 0], rotation[..., 1]
         normal, distance = unit((position + c.look_ahead * ahead)[:, None] - discs.centre)
         barrier = distance - discs.keep_off - c.look_ahead - c.margin
         slopes = np.stack((dot(normal, ahead[:, None]), c.look_ahead * dot(normal, aside[:, None])), -1)
         needed = dot(normal, discs.velocity) - c.gamma * barrier
-        scale = np.array([1.0, c.turn_weight])  # the metric of the program: |v|² + (weight·ω)²
+        scale = np.array([1.0, c.turn_weight])  # the metric of the program: v² + (weight·ω)²
         point, _ = nearest_point(nominal * scale, slopes / scale, needed, self.low * scale, self.high * scale)
         return np.clip(point / scale, self.low, self.high)

@@ -1,9 +1,9 @@
 """Where the ground vehicle wants to go: one smooth field of directions, shared by its experts.
 
-Far from any disc the field points at the goal. Near a disc that stands in the way, its part towards the disc is
-replaced by a circulation about the disc, always counter-clockwise: the disc is left on the left. Every
-expert follows this one field, so demonstrations never mix left and right turns for like readings, whose average
-would lead into the disc.
+Far from any disc the field points at the goal. Near a disc that stands in the way, its part towards the disc
+is replaced by a circulation about the disc, always counter-clockwise: the disc is left on the left. Every
+expert follows this one field, so demonstrations never mix left and right turns for like readings, whose
+average would lead into the disc.
 
 Shapes: B batch, N discs.
 """
