@@ -71,7 +71,12 @@ def training_jobs(plan: Plan, out: Path, device: str) -> list[Job]:
                 continue
             folder = demonstrations_folder(plan, env, out)
             clones = imitates(agent)
-            arguments = {"env": env, "agent": agent, "seed": seed, "config": plan.config(agent, env)}
+            arguments: dict[str, Any] = {
+                "env": env,
+                "agent": agent,
+                "seed": seed,
+                "config": plan.config(agent, env),
+            }
             arguments |= {"data": folder if clones else None, "device": device}
             output = checkpoint_path(plan, env, agent, seed, out)
             name = f"train {agent} on {env}" + (f", seed {seed}" if plan.seeds > 1 else "")
@@ -112,7 +117,7 @@ def video_jobs(plan: Plan, out: Path) -> list[Job]:
                 continue
             trained = checkpoint_path(plan, env, row, 0, out) if row in AGENTS else None
             seeds = [int(s) for s in Scenarios(0, min(CLIP_EPISODES, plan.episodes)).seeds()]
-            arguments = {"env": env, "row": row, "checkpoint": trained, "seeds": seeds}
+            arguments: dict[str, Any] = {"env": env, "row": row, "checkpoint": trained, "seeds": seeds}
             arguments |= {"noise_model": plan.noise_model, "noise_level": level}
             mark = digest(env, row, trained.name if trained else __version__, plan.noise_model, level, seeds)
             output = out / "videos" / f"{env}-{row}-{mark}.mp4"

@@ -87,7 +87,7 @@ def _trained(plan: Plan, out: Path) -> dict[str, dict[str, Any]]:
                 seconds = json.loads(path.read_text())["seconds"]
                 source = f"{plan.demos:,} expert episodes" if imitates(agent) else "trial in the environment"
                 entry = {"learned from": source, "training time": f"{seconds:.0f} s"}
-                facts[f"{agent} on {env}"] = {**entry, **_settings(plan, agent, env)}
+                facts.setdefault(agent, {})[env] = {**entry, **_settings(plan, agent, env)}
     return facts
 
 

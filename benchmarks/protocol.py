@@ -12,6 +12,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, fields
 from typing import Any
 
+from benchmarks.labels import REFERENCES
 from rise_agents import AGENTS
 from rise_agents.agent import nearest
 from rise_agents.experts import expert_names
@@ -19,8 +20,6 @@ from rise_agents.rollout import is_batched_env
 from rise_agents.seeds import RUNS, episode_seeds
 from rise_envs import ENVS
 from rise_envs.noise import make_noise
-
-REFERENCES = ("expert", "random")
 
 
 @dataclass(frozen=True)

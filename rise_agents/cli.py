@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from typing import Any, NoReturn
 
+from rise_agents.agent import nearest
+
 
 class Parser(argparse.ArgumentParser):
     """An argument parser that raises ``ValueError`` with one line instead of printing usage and exiting.
@@ -15,6 +17,14 @@ class Parser(argparse.ArgumentParser):
     def __init__(self, **kwargs: Any) -> None:
         kwargs = {"formatter_class": argparse.RawDescriptionHelpFormatter, "allow_abbrev": False, **kwargs}
         super().__init__(**kwargs)
+
+    def parse_args(self, *args: Any, **kwargs: Any) -> Any:
+        """As in argparse, but an unknown option is answered with the nearest known one."""
+        namespace, unknown = self.parse_known_args(*args, **kwargs)
+        if unknown:
+            options = [option for action in self._actions for option in action.option_strings]
+            raise ValueError(f"unknown argument {unknown[0]!r}: {nearest(unknown[0], options)}")
+        return namespace
 
     def error(self, message: str) -> NoReturn:
         """Raise ``ValueError``."""

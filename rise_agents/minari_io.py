@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -53,16 +54,20 @@ def export(d: Demonstrations, dataset_id: str) -> None:
             )
         )
     try:
-        minari.create_dataset_from_buffers(
-            dataset_id,
-            buffer=buffers,
-            env=d.env_id,
-            observation_space=env.observation_space,
-            action_space=action_space,
-            algorithm_name=str(d.card.get("expert", "unknown")),
-            description=f"Safe and successful expert episodes of {d.env_id}",
-            data_format="hdf5",
-        )
+        with warnings.catch_warnings():
+            # Minari asks for authors and links, which a local export has none of.
+            warnings.simplefilter("ignore", UserWarning)
+            minari.create_dataset_from_buffers(
+                dataset_id,
+                buffer=buffers,
+                env=d.env_id,
+                eval_env=d.env_id,
+                observation_space=env.observation_space,
+                action_space=action_space,
+                algorithm_name=str(d.card.get("expert", "unknown")),
+                description=f"Safe and successful expert episodes of {d.env_id}",
+                data_format="hdf5",
+            )
     finally:
         env.close()
 

@@ -47,8 +47,14 @@ def normal(key: ArrayLike, counter: ArrayLike) -> NDArray[np.float64]:
     return radius * np.cos(2.0 * np.pi * uniform(key, counter + np.uint64(1)))
 
 
-def key_from_seed(seed: int, tag: int = 0) -> np.uint64:
-    """The key that stands for an integer ``seed`` (≥ 0), different for every ``tag``."""
+def key_from_seed(seed: int, tag: int = 1) -> np.uint64:
+    """The key that stands for an integer ``seed`` (≥ 0), different for every ``tag`` (≥ 1).
+
+    Raises:
+        ValueError: tag 0, which NumPy takes for no tag: it would share the environment's own stream.
+    """
+    if tag < 1:
+        raise ValueError(f"tag must be at least 1, got {tag}")
     return np.random.SeedSequence((seed, tag)).generate_state(1, np.uint64)[0]
 
 

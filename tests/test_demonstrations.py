@@ -1,0 +1,149 @@
+"""Demonstrations: the same for any number of workers, safe, checked on loading, exchanged with Minari."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import safetensors.numpy as st
+
+from rise_agents import demonstrations as demos
+from rise_agents import minari_io
+from rise_agents.demonstrate import main
+from rise_agents.demonstrations import ARRAYS, CARD, DatasetError, generate, load
+
+VEHICLE = "RISE-GroundVehicle-v0"
+
+
+@pytest.fixture
+def stored(vehicle_demonstrations, tmp_path):
+    vehicle_demonstrations.save(tmp_path)
+    return tmp_path
+
+
+def test_replaying_the_actions_in_the_single_environment_gives_the_same_episodes(vehicle_demonstrations):
+    """Recorded in the batched environment, replayed by seed in the single one, bit for bit, and safe."""
+    d, env = vehicle_demonstrations, gym.make(VEHICLE)
+    for i in range(5):
+        observation, _ = env.reset(seed=int(d.seeds[i]))
+        for row in range(d.offsets[i], d.offsets[i + 1]):
+            for key, value in observation.items():
+                np.testing.assert_array_equal(value, d.observations[key][row])
+            observation, reward, terminated, truncated, info = env.step(d.actions[row])
+            assert reward == pytest.approx(d.rewards[row], abs=1e-12)
+            assert info["cost"] == 0
+        assert terminated and not truncated
+        for key, value in observation.items():
+            np.testing.assert_array_equal(value, d.final[key][i])
+
+
+def test_workers_do_not_change_the_result(vehicle_demonstrations, monkeypatch):
+    monkeypatch.setattr(demos, "CHUNK", 100)  # two chunks, so that both workers have one
+    alone, shared = generate(VEHICLE, "cbf", 120), generate(VEHICLE, "cbf", 120, workers=2)
+    for name, array in alone.arrays().items():
+        np.testing.assert_array_equal(shared.arrays()[name], array)
+    assert alone.card == shared.card
+    np.testing.assert_array_equal(
+        alone.actions[: len(vehicle_demonstrations.actions)], vehicle_demonstrations.actions
+    )
+
+
+def test_unsafe_and_unsuccessful_episodes_are_left_out_and_counted(monkeypatch):
+    """An expert that heads straight for the goal collides in most episodes; those that stay are safe."""
+
+    class Straight:
+        def __init__(self, *args, **kwargs):
+            pass
+
+        def predict(self, observation, state=None, episode_start=None, deterministic=False):
+            way = observation["desired_goal"] - observation["achieved_goal"]
+            turn = np.arctan2(way[:, 1], way[:, 0]) - observation["observation"][:, 2]
+            turn = (turn + np.pi) % (2 * np.pi) - np.pi
+            return np.column_stack((np.full(len(way), 2.5), np.clip(3 * turn, -1.5, 1.5))), None
+
+    monkeypatch.setattr(demos, "make_expert", lambda *args, **kwargs: Straight())
+    d = generate(VEHICLE, "straight", 20)
+    assert len(d) == 20
+    assert (d.costs == 0).all()
+    assert d.card["tried"] > 40
+    assert d.card["rejection_rate"] == 1 - 20 / d.card["tried"]
+
+
+def test_store_and_load(stored, vehicle_demonstrations):
+    again = load(stored)
+    for name, array in vehicle_demonstrations.arrays().items():
+        np.testing.assert_array_equal(again.arrays()[name], array)
+
+
+def test_first_and_subsample(vehicle_demonstrations):
+    part = vehicle_demonstrations.first(3)
+    assert len(part) == 3
+    assert len(part.actions) == part.offsets[-1] == vehicle_demonstrations.offsets[3]
+    assert len(vehicle_demonstrations.subsample(10)["obstacle"]) <= 10
+
+
+def _forge(folder, change):
+    """Change the arrays and make the card's digest fit, as somebody who means harm would."""
+    arrays = st.load((folder / ARRAYS).read_bytes())
+    card = json.loads((folder / CARD).read_text())
+    change(arrays, card)
+    body = st.save(arrays)
+    (folder / ARRAYS).write_bytes(body)
+    (folder / CARD).write_text(json.dumps({**card, "sha256": hashlib.sha256(body).hexdigest()}))
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda a, c: a["actions"].__setitem__((0, 0), np.nan), "actions.*not finite.*row 0"),
+        (lambda a, c: a["actions"].__setitem__((3, 1), 9.0), "actions leaves the bounds.*row 3"),
+        (lambda a, c: a["costs"].__setitem__(5, 1.0), "not safe"),
+        (lambda a, c: a["offsets"].__setitem__(-1, 7), "offsets"),
+        (lambda a, c: a.update(rewards=a["rewards"][:-1].copy()), "rewards"),
+        (lambda a, c: a.pop("observations.obstacle"), "observations.obstacle"),
+        (lambda a, c: c.update(env="os:system"), "unknown environment"),
+        (lambda a, c: c.update(schema=99), "schema"),
+    ],
+)
+def test_forged_sets_are_refused(stored, change, reason):
+    _forge(stored, change)
+    with pytest.raises(DatasetError, match=reason):
+        load(stored)
+
+
+def test_damaged_and_missing_sets_are_refused(stored, tmp_path):
+    body = bytearray((stored / ARRAYS).read_bytes())
+    body[len(body) // 2] ^= 4
+    (stored / ARRAYS).write_bytes(body)
+    with pytest.raises(DatasetError, match="damaged"):
+        load(stored)
+    with pytest.raises(DatasetError, match="no demonstration set"):
+        load(tmp_path / "nowhere")
+
+
+def test_minari_round_trip(vehicle_demonstrations, tmp_path, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    part = vehicle_demonstrations.first(6)
+    minari_io.export(part, "rise/vehicle-v0")
+    again = minari_io.load("rise/vehicle-v0", VEHICLE)
+    for name, array in part.arrays().items():
+        np.testing.assert_array_equal(again.arrays()[name], array)
+    with pytest.raises(DatasetError, match="nothing/here-v0"):
+        minari_io.load("nothing/here-v0", VEHICLE)
+    with pytest.raises(DatasetError, match="observation"):
+        minari_io.load("rise/vehicle-v0", "RISE-SafePanda-v0")
+
+
+def test_command_line(tmp_path, capsys):
+    out = tmp_path / "set"
+    arguments = ["--env", VEHICLE, "--expert", "cbf", "--episodes", "5", "--workers", "1", "--out", str(out)]
+    assert main(arguments) == 0
+    assert "5 episodes" in capsys.readouterr().out
+    assert len(load(out)) == 5
+    assert main(arguments) == 2
+    assert "holds a demonstration set already" in capsys.readouterr().err
+    assert main(["--env", "RISE-GroundVehicl-v0", "--out", str(out)]) == 2
+    assert "did you mean 'RISE-GroundVehicle-v0'" in capsys.readouterr().err

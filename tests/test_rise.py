@@ -1,0 +1,169 @@
+"""Algorithm 1, line by line, against torch.distributions and hand-made cases."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch.distributions import Independent, Normal, kl_divergence
+
+from rise_agents import cloning, make_agent
+from rise_agents.networks import Encoder, gaussian_kl, mlp, reparameterise
+from rise_agents.rise import VAE, Config, Rise, policy_loss
+from rise_agents.training import to_arrays
+
+VEHICLE = "RISE-GroundVehicle-v0"
+BRIEF = {"updates": 40, "vae_updates": 40, "batch_size": 32, "vae_batch_size": 32, "n_samples": 3}
+
+
+@pytest.fixture(scope="module")
+def trained(vehicle_demonstrations):
+    return make_agent("rise", VEHICLE, BRIEF, seed=1).learn(vehicle_demonstrations)
+
+
+def test_kl_equals_torch_distributions():
+    mu, log_sigma = torch.randn(50, 5), torch.randn(50, 5)
+    posterior = Independent(Normal(mu, log_sigma.exp()), 1)
+    prior = Independent(Normal(torch.zeros(50, 5), torch.ones(50, 5)), 1)
+    torch.testing.assert_close(gaussian_kl(mu, log_sigma), kl_divergence(posterior, prior))
+
+
+def test_elbo_is_gaussian_likelihood_plus_weighted_kl():
+    """Up to the constant of the normal density, the loss is −log p(c | z) + β KL with unit deviation."""
+    torch.manual_seed(0)
+    vae, c, epsilon = VAE(5, Config()), torch.randn(7, 5), torch.randn(7, 5)
+    target = 3 * c + 1
+    terms = vae.loss(c, target, epsilon, beta=0.3)
+    mu, log_sigma = vae.encoder(c)
+    z = mu + log_sigma.exp() * epsilon
+    log_p = Normal(vae.decoder(z), 1.0).log_prob(target).sum(-1)
+    constant = 2.5 * np.log(2 * np.pi)
+    kl = kl_divergence(Normal(mu, log_sigma.exp()), Normal(0.0, 1.0)).sum(-1)
+    torch.testing.assert_close(terms["loss"], (-log_p - constant + 0.3 * kl).mean())
+
+
+def test_reparameterisation_has_the_posterior_s_moments():
+    mu, log_sigma = torch.tensor([1.0, -2.0]), torch.tensor([0.3, -1.0])
+    z = reparameterise(mu, log_sigma, torch.randn(200_000, 2, generator=torch.Generator().manual_seed(0)))
+    torch.testing.assert_close(z.mean(0), mu, atol=0.01, rtol=0)
+    torch.testing.assert_close(z.std(0), log_sigma.exp(), atol=0.01, rtol=0)
+
+
+def test_policy_loss_is_the_mean_over_m_samples():
+    torch.manual_seed(0)
+    policy, robot, action = mlp(4 + 2, (8,), 3), torch.randn(6, 4), torch.randn(6, 3)
+    mu, log_sigma, epsilon = torch.randn(6, 2), torch.randn(6, 2), torch.randn(5, 6, 2)
+    total = 0.0
+    policy.requires_grad_(False)
+    for m in range(5):
+        for row in range(6):
+            z = mu[row] + log_sigma[row].exp() * epsilon[m, row]
+            guess = policy(torch.cat((robot[row], z)))
+            total += float(((guess - action[row]) ** 2).sum())
+    loss = policy_loss(policy, robot, mu, log_sigma, action, epsilon, "mse")["loss"]
+    assert float(loss) == pytest.approx(total / (5 * 6), rel=1e-5)
+
+
+def test_nll_loss_equals_torch_distributions():
+    output, action = torch.randn(4, 6), torch.randn(4, 3)
+    mean, log_std = output.chunk(2, -1)
+    expected = -Normal(mean, log_std.exp()).log_prob(action).sum(-1).mean() - 1.5 * np.log(2 * np.pi)
+    torch.testing.assert_close(cloning.imitation_loss(output, action, "nll"), expected.float())
+
+
+def test_stage_two_leaves_the_vae_as_it_was(vehicle_demonstrations, monkeypatch):
+    """The weights right after stage 1 are the weights that are stored, and no gradient reaches them."""
+    seen = {}
+    fit_policy = Rise._fit_policy
+
+    def spy(self, policy, data, posterior, generator, progress):
+        assert not any(part.requires_grad for part in posterior)
+        fit_policy(self, policy, data, posterior, generator, progress)
+
+    fit_vae = Rise._fit_vae
+
+    def remember(self, vae, *args):
+        fit_vae(self, vae, *args)
+        seen.update(to_arrays(vae, "vae"))
+
+    monkeypatch.setattr(Rise, "_fit_policy", spy)
+    monkeypatch.setattr(Rise, "_fit_vae", remember)
+    agent = make_agent("rise", VEHICLE, BRIEF).learn(vehicle_demonstrations)
+    assert len(seen) == 14  # encoder trunk, two heads, decoder: weights and biases
+    for name, weights in seen.items():
+        np.testing.assert_array_equal(agent._arrays[name], weights)
+
+
+def test_encoder_in_numpy_equals_torch(trained):
+    encoder = Encoder(5, trained.config.encoder_hidden, trained.config.latent)
+    own = {
+        k.removeprefix("vae.encoder."): v for k, v in trained._arrays.items() if k.startswith("vae.encoder.")
+    }
+    encoder.load_state_dict({key: torch.from_numpy(value) for key, value in own.items()})
+    reading = np.random.default_rng(0).normal(size=(20, 5)).astype(np.float32)
+    mu, sigma = trained.encode(reading)
+    with torch.no_grad():
+        expected_mu, expected_log_sigma = encoder(torch.from_numpy(reading))
+    spread = trained._arrays["vae.spread"]
+    np.testing.assert_allclose(mu * spread, expected_mu, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(sigma * spread, expected_log_sigma.exp(), rtol=1e-4, atol=1e-5)
+
+
+def test_inference_draws_z_from_the_posterior(trained, vehicle_demonstrations, monkeypatch):
+    """z handed to the policy over many draws has the posterior's mean and deviation, and is standard normal inside."""
+    rows = 20_000
+    one = {key: np.repeat(value[:1], rows, 0) for key, value in vehicle_demonstrations.observations.items()}
+    drawn = []
+    act = trained._act
+    monkeypatch.setattr(trained, "_act", lambda robot, z: drawn.append(z) or act(robot, z))
+    trained.predict(one, state=trained.initial_state(np.arange(rows, dtype=np.uint64)))
+    mu, sigma = trained.encode(trained._eyes(one)[1][:1])
+    epsilon = (drawn[0] - mu) / sigma
+    np.testing.assert_allclose(epsilon.mean(0), 0, atol=0.03)
+    np.testing.assert_allclose(np.cov(epsilon.T), np.eye(epsilon.shape[1]), atol=0.03)
+
+
+def test_deterministic_acts_on_the_posterior_mean(trained, vehicle_demonstrations):
+    observation = {key: value[:9] for key, value in vehicle_demonstrations.observations.items()}
+    robot, reading = trained._eyes(observation)
+    expected = trained.units.to_action(trained._act(robot, trained.encode(reading)[0]))
+    action, _ = trained.predict(observation, deterministic=True)
+    np.testing.assert_array_equal(action, expected)
+
+
+def test_average_of_many_samples_has_less_spread(vehicle_demonstrations):
+    """The K-sample average: the spread of the action over draws falls as 1/√K where nothing is clipped."""
+    agent = make_agent("rise", VEHICLE, {**BRIEF, "beta": 1.0}).learn(vehicle_demonstrations)
+    one = {key: np.repeat(value[:1], 4_000, 0) for key, value in vehicle_demonstrations.observations.items()}
+    spreads = []
+    for average in (1, 16):
+        object.__setattr__(agent.config, "average", average)
+        action, _ = agent.predict(one, state=agent.initial_state(np.arange(4_000, dtype=np.uint64)))
+        spreads.append(action[:, 1].std())
+    assert spreads[1] == pytest.approx(spreads[0] / 4, rel=0.1)
+
+
+def test_decoder_answers_in_units_of_the_reading_noise(trained, vehicle_demonstrations):
+    """Standard units times the stored ratio are SI units over the noise scale (1 on the vehicle), but for the mean."""
+    observation = vehicle_demonstrations.subsample(50)
+    c = trained._eyes(observation)[1] * trained._arrays["vae.ratio"]
+    from rise_agents.readings import inputs
+
+    raw = inputs(trained.task, "body", observation)[1]
+    np.testing.assert_allclose(c - c.mean(0), raw - raw.mean(0), atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [
+        ("beta", -1),
+        ("latent", 0),
+        ("n_samples", 0),
+        ("frame", "moon"),
+        ("loss", "mae"),
+        ("learning_rate", 0.0),
+    ],
+)
+def test_settings_out_of_range_are_refused(setting, value):
+    with pytest.raises(ValueError, match=setting):
+        make_agent("rise", VEHICLE, {setting: value})
