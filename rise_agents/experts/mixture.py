@@ -19,7 +19,6 @@ from rise_envs.task import Task
 Array = NDArray[np.float64]
 Keys = NDArray[np.uint64]
 
-_OWN = 3  # arrays of the state that are the mixture's: choice, key, steps
 _CHOICE, _NEXT, _MEMBER = 0, 1, 2  # purposes that a key is split for
 
 
@@ -44,12 +43,15 @@ class Mixture:
             raise ValueError(f"Mixture needs one expert for each of {self.names}, got {len(experts)}")
         self.task, self.experts, self.seed = task, tuple(experts), seed
 
+    def choose(self, keys: Keys) -> NDArray[np.int64]:
+        """Which expert drives each of the episodes with the given keys (B,): indices into ``names``."""
+        draw = streams.uniform(streams.split(keys, _CHOICE), 0)
+        return (draw * len(self.experts)).astype(np.int64)
+
     def initial_state(self, keys: Keys) -> tuple[NDArray, ...]:
         """The state at the start of the episodes with the given keys, (B,) uint64."""
-        keys = np.asarray(keys, dtype=np.uint64)
-        draw = streams.uniform(streams.split(keys, _CHOICE), 0)
-        choice = (draw * len(self.experts)).astype(np.int64)
-        state: list[NDArray] = [choice, keys.copy(), np.zeros(len(keys), np.int64)]
+        keys = np.array(keys, dtype=np.uint64)
+        state: list[NDArray] = [self.choose(keys), keys, np.zeros(len(keys), np.int64)]
         for index, expert in enumerate(self.experts):
             state += initial_state(expert, streams.split(keys, _MEMBER + index)) or ()
         return tuple(state)

@@ -66,6 +66,10 @@ class PandaCBF:
     def __init__(self, task: Task, seed: int = 0, config: Config = Config()) -> None:
         self.task, self.config = task, config
 
+    def initial_state(self, keys: NDArray[np.uint64]) -> tuple[Array, ...]:
+        """The state at the start of the episodes with the given keys (B,): no side taken yet, (B, 3)."""
+        return (np.zeros((len(keys), 3)),)
+
     def predict(
         self,
         observation: Mapping[str, Array],

@@ -193,6 +193,10 @@ class PandaMPC:
         table[:, 0] = 0.0  # the mean itself is a sample
         self._table = table
 
+    def initial_state(self, keys: NDArray[np.uint64]) -> tuple[Array, ...]:
+        """The state at the start of the episodes with the given keys (B,): no side, no action yet, (B, 3) each."""
+        return np.zeros((len(keys), 3)), np.zeros((len(keys), 3))
+
     def predict(
         self,
         observation: Mapping[str, Array],
