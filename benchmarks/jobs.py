@@ -21,8 +21,6 @@ from rise_agents import AGENTS, __version__, agent_class, demonstrations, make_a
 from rise_agents.agent import Progress, make_config, silent
 from rise_agents.rollout import rollout
 
-CLIP_EPISODES = 3  # test scenarios that a clip shows
-
 
 @dataclass(frozen=True)
 class Job:
@@ -116,7 +114,7 @@ def video_jobs(plan: Plan, out: Path) -> list[Job]:
             if seed:
                 continue
             trained = checkpoint_path(plan, env, row, 0, out) if row in AGENTS else None
-            seeds = [int(s) for s in Scenarios(0, min(CLIP_EPISODES, plan.episodes)).seeds()]
+            seeds = [int(s) for s in Scenarios(0, min(plan.clips, plan.episodes)).seeds()]
             arguments: dict[str, Any] = {"env": env, "row": row, "checkpoint": trained, "seeds": seeds}
             arguments |= {"noise_model": plan.noise_model, "noise_level": level}
             mark = digest(env, row, trained.name if trained else __version__, plan.noise_model, level, seeds)

@@ -43,6 +43,7 @@ class Preset:
         episodes: test scenarios per condition.
         noise_levels: multiples of the environment's noise scale.
         seeds: training seeds.
+        clips: scenarios that a video shows.
         settings: per agent or per ``agent@environment``, settings that differ from the agent's own.
     """
 
@@ -50,6 +51,7 @@ class Preset:
     episodes: int
     noise_levels: tuple[float, ...]
     seeds: int
+    clips: int = 3
     settings: dict[str, dict[str, Any]] = field(default_factory=dict)
 
 
@@ -60,6 +62,7 @@ PRESETS = {
         episodes=16,
         noise_levels=(1.0,),
         seeds=1,
+        clips=1,
         settings={
             "pcbc": _BRIEF,
             "rise": {**_BRIEF, "vae_updates": 300, "vae_batch_size": 64},
@@ -97,6 +100,7 @@ class Plan:
     noise_model: str
     noise_levels: tuple[float, ...]
     seeds: int
+    clips: int = 3
     expert: str = "mixture"
     settings: dict[str, dict[str, Any]] = field(default_factory=dict)
 

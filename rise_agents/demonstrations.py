@@ -24,12 +24,12 @@ import rise_envs
 from rise_agents.checkpoint import replace_file, versions
 from rise_agents.experts import make_expert
 from rise_agents.rollout import Transitions, policy_keys, rollout
-from rise_agents.seeds import episode_seeds
+from rise_agents.seeds import PER_RUN, episode_seeds
 from rise_agents.workers import make_pool
 from rise_envs.task import env_class
 
 SCHEMA = 1
-CHUNK = 100  # candidate episodes per job: fixed, so that the result does not depend on the workers
+CHUNK = 50  # candidate episodes per job, at most
 ARRAYS, CARD = "demonstrations.safetensors", "card.json"
 OBSERVATIONS = ("observation", "achieved_goal", "desired_goal", "obstacle")
 
@@ -238,18 +238,20 @@ def generate(
 
 def _ordered(env_id: str, expert: str, episodes: int, seed: int, workers: int) -> Any:
     """Chunks of candidates in order, computed by ``workers`` processes a little ahead of need."""
-    if workers <= 1:
-        for start in range(0, 1_000_000, CHUNK):
-            yield _candidates(env_id, expert, seed, start, CHUNK)
+    chunk = min(CHUNK, max(10, episodes))
+    if workers <= 1 or episodes <= chunk:
+        for start in range(0, PER_RUN, chunk):
+            yield _candidates(env_id, expert, seed, start, chunk)
+        return
     with make_pool(workers) as pool:
         try:
             queue: list[Any] = [
-                pool.submit(_candidates, env_id, expert, seed, i * CHUNK, CHUNK)
-                for i in range(max(workers, -(-episodes // CHUNK)))
+                pool.submit(_candidates, env_id, expert, seed, i * chunk, chunk)
+                for i in range(max(workers, -(-episodes // chunk)))
             ]
-            for number in range(1_000_000 // CHUNK):
+            for number in range(PER_RUN // chunk):
                 if number >= len(queue):
-                    queue.append(pool.submit(_candidates, env_id, expert, seed, number * CHUNK, CHUNK))
+                    queue.append(pool.submit(_candidates, env_id, expert, seed, number * chunk, chunk))
                 yield queue[number].result()
                 queue[number] = None  # frees the arrays
         finally:

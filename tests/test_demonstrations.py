@@ -40,8 +40,7 @@ def test_replaying_the_actions_in_the_single_environment_gives_the_same_episodes
             np.testing.assert_array_equal(value, d.final[key][i])
 
 
-def test_workers_do_not_change_the_result(vehicle_demonstrations, monkeypatch):
-    monkeypatch.setattr(demos, "CHUNK", 100)  # two chunks, so that both workers have one
+def test_workers_do_not_change_the_result(vehicle_demonstrations):
     alone, shared = generate(VEHICLE, "cbf", 120), generate(VEHICLE, "cbf", 120, workers=2)
     for name, array in alone.arrays().items():
         np.testing.assert_array_equal(shared.arrays()[name], array)
