@@ -15,7 +15,7 @@ from rise_envs import geometry, obstacles, streams
 from rise_envs.obstacles import Motion
 
 Array = NDArray[np.float64]
-MAX_ATTEMPTS = 10_000
+MAX_ATTEMPTS = 2_000
 
 
 @dataclass(frozen=True)
