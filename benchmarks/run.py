@@ -130,7 +130,20 @@ def plan_of(arguments: argparse.Namespace) -> Plan:
     check_settings(plan)
     if arguments.workers is not None and arguments.workers < 1:
         raise ValueError(f"--workers must be at least 1, got {arguments.workers}")
+    _check_device(arguments.device)
     return plan
+
+
+def _check_device(device: str) -> None:
+    if device == "cpu":
+        return
+    import torch
+
+    try:
+        torch.zeros(1, device=device)
+    except (AssertionError, RuntimeError) as error:
+        reason = str(error).splitlines()[0]
+        raise ValueError(f"--device {device} cannot be used here: {reason}") from None
 
 
 def prepare_folder(out: Path) -> None:

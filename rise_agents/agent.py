@@ -93,12 +93,20 @@ def config_from_dict(kind: type, values: dict[str, Any]) -> Any:
     Raises:
         ValueError: an unknown key, with the nearest known one.
     """
-    known = {field.name for field in fields(kind)}
-    for key in values:
+    known = {field.name: field.default for field in fields(kind)}
+    for key, value in values.items():
         if key not in known:
             raise ValueError(f"unknown setting {key!r}: {nearest(key, known)}")
+        _check_kind(key, value, known[key])
     plain = {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
     return kind(**plain)
+
+
+def _check_kind(key: str, value: Any, default: Any) -> None:
+    """Raise ``ValueError`` unless ``value`` is of the kind of the setting's default (None: of any kind)."""
+    kinds = {int: (int,), float: (int, float), str: (str,), tuple: (tuple, list)}.get(type(default))
+    if kinds and (not isinstance(value, kinds) or isinstance(value, bool)):
+        raise ValueError(f"{key} must be a {type(default).__name__} such as {default!r}, got {value!r}")
 
 
 def make_config(kind: Any, env_id: str, values: dict[str, Any]) -> Any:

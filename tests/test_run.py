@@ -1,0 +1,177 @@
+"""The benchmark command: outputs, resuming, independence of workers, errors people meet."""
+
+from __future__ import annotations
+
+import csv
+import json
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+
+from benchmarks import results
+from benchmarks.executors import run_jobs
+from benchmarks.jobs import Job
+from benchmarks.protocol import PRESETS, make_plan
+from benchmarks.run import main
+from rise_agents.seeds import SPLITS
+
+VEHICLE = "RISE-GroundVehicle-v0"
+SMALL = ["--agents", "rise", "pcbc", "random", "--envs", VEHICLE, "--preset", "smoke", "--expert", "cbf"]
+SMALL += ["--episodes", "6", "--noise-levels", "0", "1"]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    out = tmp_path_factory.mktemp("run")
+    assert main([*SMALL, "--workers", "1", "--out", str(out)]) == 0
+    return out
+
+
+def test_every_promised_file_is_there(run):
+    names = {path.name for path in run.iterdir()}
+    assert names >= {
+        "episodes.parquet",
+        "summary.csv",
+        "summary.md",
+        "comparison.png",
+        "noise_curve.png",
+        "run.json",
+    }
+    assert len(list((run / "videos").glob("*.mp4"))) == 3
+    assert len(list((run / "videos").glob("*-frames.png"))) == 3
+    assert not list(run.rglob("*.tmp"))
+
+
+def test_rows_are_paired_test_scenarios(run):
+    rows = results.read_rows(run / "episodes.parquet").to_pylist()
+    assert len(rows) == 3 * 2 * 6
+    assert all(row["env_seed"] >= SPLITS["test"] for row in rows)
+    for agent in ("rise", "pcbc", "random"):
+        own = [row["env_seed"] for row in rows if row["agent"] == agent and row["noise_level"] == 1]
+        assert own == [SPLITS["test"] + n for n in range(6)]
+
+
+def test_summary_has_the_promised_columns(run):
+    with (run / "summary.csv").open() as file:
+        lines = list(csv.DictReader(file))
+    assert list(lines[0]) == [
+        *("env", "agent", "noise_model", "noise_level", "train_seeds", "episodes"),
+        *("safety_rate", "safety_low", "safety_high", "reach_rate", "reach_low", "reach_high"),
+        *("arrival_rate", "mean_cost", "mean_steps"),
+    ]
+    assert len(lines) == 6
+    for line in lines:
+        assert 0 <= float(line["safety_low"]) <= float(line["safety_rate"]) <= float(line["safety_high"]) <= 1
+        assert (
+            float(line["reach_rate"]) <= min(float(line["arrival_rate"]), float(line["safety_rate"])) + 1e-9
+        )
+
+
+def test_run_json_tells_how_to_repeat(run):
+    record = json.loads((run / "run.json").read_text())
+    assert record["plan"]["noise_levels"] == [0.0, 1.0]
+    assert record["demonstrations"][VEHICLE]["expert"] == "cbf"
+    assert record["settings"][f"rise@{VEHICLE}"]["updates"] == PRESETS["smoke"].settings["rise"]["updates"]
+    assert "--noise-levels 0 1" in record["command"]
+
+
+# imageio-ffmpeg leaves its pipes to the garbage collector after reading.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_clips_are_videos_that_move(run):
+    for path in (run / "videos").glob("*.mp4"):
+        with iio.imopen(path, "r", plugin="FFMPEG") as file:
+            frames = file.read()
+        assert len(frames) > 20
+        assert np.abs(frames[0].astype(int) - frames[-1].astype(int)).max() > 50
+
+
+def test_again_in_the_same_folder_redoes_nothing(run, capfd):
+    tables = {name: (run / name).read_bytes() for name in ("episodes.parquet", "summary.csv", "summary.md")}
+    work = [path for folder in ("agents", "parts", "videos") for path in (run / folder).rglob("*.*")]
+    before = {path: path.stat().st_mtime_ns for path in work}
+    assert main([*SMALL, "--workers", "1", "--out", str(run)]) == 0
+    assert {path: path.stat().st_mtime_ns for path in work} == before
+    assert {name: (run / name).read_bytes() for name in tables if name != "summary.md"} == {
+        name: content for name, content in tables.items() if name != "summary.md"
+    }
+    assert "done already" in capfd.readouterr().err
+
+
+def test_workers_do_not_change_the_tables(run, tmp_path):
+    assert main([*SMALL, "--workers", "2", "--no-videos", "--out", str(tmp_path)]) == 0
+    for name in ("episodes.parquet", "summary.csv"):
+        assert (tmp_path / name).read_bytes() == (run / name).read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--agents", "rize"], "did you mean 'rise'"),
+        (["--envs", "RISE-SafePnda-v0"], "did you mean 'RISE-SafePanda-v0'"),
+        (["--preset", "quik"], "did you mean 'quick'"),
+        (["--expert", "mixtur"], "did you mean 'mixture'"),
+        (["--noise-model", "stepp"], "did you mean 'step'"),
+        (["--noise-levels", "-1"], "not negative"),
+        (["--noise-levels", "nan"], "finite"),
+        (["--noise-levels", "lots"], "invalid float"),
+        (["--episodes", "0"], "episodes must be"),
+        (["--demos", "0"], "demos must be"),
+        (["--seeds", "0"], "seeds must be"),
+        (["--workers", "0"], "--workers must be"),
+        (["--set", "rise.betta=1"], "did you mean 'beta'"),
+        (["--set", "rise.beta=-1"], "beta must not be negative"),
+        (["--set", "rise.beta=large"], "beta"),
+        (["--set", "beta"], "AGENT.FIELD=VALUE"),
+        (["--set", "risee.beta=1"], "did you mean 'rise'"),
+        (["--noise-level", "1"], "did you mean '--noise-levels'"),
+        (["--out", "/proc/nowhere"], "cannot write"),
+        (["--device", "cuda:77"], "device"),
+    ],
+)
+def test_bad_arguments_end_in_one_line_and_exit_code_2(arguments, says, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    error = capsys.readouterr().err
+    assert says in error
+    assert error.count("\n") == 1
+    assert not list(tmp_path.rglob("*"))
+
+
+def test_a_plan_adds_the_user_s_choices_to_the_preset():
+    plan = make_plan(
+        "smoke",
+        {"rise": {"beta": 0.2}},
+        agents=("rise", "expert"),
+        envs=(VEHICLE,),
+        noise_model="step",
+        episodes=5,
+    )
+    assert plan.episodes == 5
+    assert plan.demos == PRESETS["smoke"].demos
+    assert plan.config("rise", VEHICLE)["beta"] == 0.2
+    assert plan.config("rise", VEHICLE)["updates"] == PRESETS["smoke"].settings["rise"]["updates"]
+    assert [row for row, _ in plan.rows(VEHICLE)] == ["rise", "expert-cbf", "expert-mpc", "expert-mixture"]
+
+
+def _write(output, progress, text):
+    output.write_text(text)
+
+
+def _break(output, progress):
+    raise ValueError("on purpose")
+
+
+def test_a_failing_job_is_named_and_stops_only_what_needs_it(tmp_path):
+    bad, good, after = (tmp_path / name for name in ("bad", "good", "after"))
+    jobs = [
+        Job("after", _write, {"text": "3"}, after, needs=(bad,)),
+        Job("bad", _break, {}, bad),
+        Job("good", _write, {"text": "2"}, good),
+    ]
+    failures = run_jobs(jobs, 2, lambda job, share, figures: None)
+    assert {failure.job.name: failure.reason for failure in failures} == {
+        "bad": "ValueError: on purpose",
+        "after": "a job that it needs failed",
+    }
+    assert good.read_text() == "2"
