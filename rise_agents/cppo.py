@@ -14,7 +14,7 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -26,7 +26,18 @@ from stable_baselines3.common.logger import Logger
 
 from rise_agents import checkpoint, readings
 from rise_agents.actor import Actor
-from rise_agents.agent import Progress, State, config_from_dict, config_to_dict, nearest, require, silent
+from rise_agents.agent import (
+    Progress,
+    State,
+    config_to_dict,
+    draw_state,
+    fresh_state,
+    make_config,
+    nearest,
+    require,
+    silent,
+)
+from rise_agents.cloning import make_task
 from rise_agents.lagrangian import ConstrainedPPO, Controller
 from rise_agents.seeds import episode_seeds
 from rise_agents.vec_env import (
@@ -36,12 +47,10 @@ from rise_agents.vec_env import (
     make_training_env,
     random_inputs,
 )
-from rise_envs import streams
-from rise_envs.task import Task, task_of
+from rise_envs.task import Task
 
 FRAMES = (*readings.FRAMES, "raw")
 _STATISTICS_SAMPLES = 4096  # observations that the units of the inputs are taken from
-_ACTING = 0xC990  # tag of the stream that exploration draws from when the caller gives none
 
 
 @dataclass(frozen=True)
@@ -138,10 +147,6 @@ class Config:
         )
 
 
-# Settings that differ from the defaults because they were found to serve an environment better.
-PRESETS: dict[str, dict[str, Any]] = {}
-
-
 class CPPO:
     """An agent that learns by constrained PPO; see the module's docstring.
 
@@ -155,8 +160,10 @@ class CPPO:
         ValueError: an unknown setting, one out of range, or a frame that the environment does not offer.
     """
 
+    name = "cppo"
     Config = Config
-    PRESETS = PRESETS
+    # Settings that were found to serve an environment better than the defaults.
+    PRESETS: ClassVar[dict[str, dict[str, Any]]] = {}
     learns_from = "environment"
     evaluate_deterministic = True
 
@@ -164,9 +171,9 @@ class CPPO:
         self, env_id: str, config: dict[str, Any] | None = None, seed: int = 0, device: str = "cpu"
     ) -> None:
         self.env_id, self.seed, self.device = env_id, seed, device
-        self.config: Config = config_from_dict(Config, {**PRESETS.get(env_id, {}), **(config or {})})
+        self.config = make_config(type(self), env_id, config or {})
         self._task = self._describe()
-        self._stream = streams.key_from_seed(seed, _ACTING)
+        self._rng = np.random.default_rng(seed)
         self._arrays: dict[str, NDArray] = {}  # what training left behind, in the form that is stored
         self._notes: dict[str, Any] = {}
         self._actor: Actor | None = None
@@ -175,7 +182,7 @@ class CPPO:
         if self.config.frame == "raw":
             return None
         try:
-            return task_of(self.env_id)
+            return make_task(self.env_id)
         except ValueError as error:
             raise ValueError(f"{error}, or choose frame='raw'") from None
 
@@ -255,9 +262,9 @@ class CPPO:
         flat = [np.asarray(parts[key], np.float64).reshape(len(parts[key]), -1) for key in sorted(parts)]
         return np.concatenate(flat, -1)
 
-    def initial_state(self, keys: NDArray[np.uint64]) -> tuple[NDArray[np.uint64], NDArray[np.uint64]]:
-        """Random streams of the episodes with these keys (B,): each row a key and how often it drew."""
-        return np.asarray(keys, np.uint64), np.zeros(len(keys), np.uint64)
+    def initial_state(self, keys: NDArray[np.uint64]) -> State:
+        """Streams of exploration noise for episodes with the given keys (B,)."""
+        return fresh_state(keys)
 
     def predict(
         self,
@@ -270,8 +277,8 @@ class CPPO:
 
         Args:
             observation: the environment's, single or with a leading batch dimension.
-            state: what the last call returned, or :meth:`initial_state`; None starts the agent's own streams.
-            episode_start: (B,), rows that begin an episode: those that drew before go on to a new stream.
+            state: what the last call returned, or :meth:`initial_state`.
+            episode_start: (B,), rows whose stream of noise starts anew.
             deterministic: the mean (or likeliest) action instead of a draw from the policy.
 
         Returns:
@@ -288,10 +295,7 @@ class CPPO:
             parts = {key: np.asarray(part)[None] for key, part in parts.items()}
         output = self._actor.output(self._inputs(parts))
         if not deterministic:
-            keys, counter = state or self.initial_state(streams.bits(self._stream, np.arange(len(output))))
-            if episode_start is not None:
-                again = np.asarray(episode_start, bool) & (counter > 0)
-                keys, counter = np.where(again, streams.split(keys, 1), keys), np.where(again, 0, counter)
+            keys, counter = draw_state(state, episode_start, len(output), self._rng)
             output = self._actor.explore(output, keys, counter)
             state = keys, counter + np.uint64(1)
         action = self._actor.action(output)
@@ -305,7 +309,7 @@ class CPPO:
         """
         if self._actor is None:
             raise RuntimeError("this C-PPO agent is untrained: call learn() before save()")
-        description = {"agent": "cppo", "env": self.env_id, "seed": self.seed, "notes": self._notes}
+        description = {"agent": self.name, "env": self.env_id, "seed": self.seed, "notes": self._notes}
         checkpoint.save(path, self._arrays, {**description, "config": config_to_dict(self.config)})
 
     @classmethod

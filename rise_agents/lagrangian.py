@@ -5,7 +5,9 @@ with J the mean cost of an episode and d its limit, after every roll-out
 
     Δ = J − d,   I ← (I + K_I Δ)₊,   ∂ = (J − J_before)₊,   λ = (K_P Δ + I + K_D ∂)₊
 
-and the policy follows the advantage (A_r − λ A_c) / (1 + λ).
+and the policy follows the advantage A_r − λ A_c, standardised. The paper divides by 1 + λ, for the same end of a
+step size that λ leaves alone; standardising the sum instead of A_r keeps λ the price of cost in units of reward
+while the spread of A_r shrinks in training (with it, the vehicle learned faster and ended safer).
 
 Shapes: T steps, B sub-environments, K network inputs.
 """
@@ -68,9 +70,9 @@ class Controller:
 
 
 def constrained_advantage(reward: Array, cost: Array, multiplier: float) -> Array:
-    """(A_r − λ A_c) / (1 + λ), with A_r standardised and A_c centred, so that λ counts in units of cost."""
-    standard = (reward - reward.mean()) / (reward.std() + 1e-8)
-    return (standard - multiplier * (cost - cost.mean())) / (1.0 + multiplier)
+    """A_r − λ A_c, standardised over the roll-out (finite even where both are constant)."""
+    total = reward - multiplier * cost
+    return (total - total.mean()) / (total.std() + 1e-8)
 
 
 class ConstrainedPPO(PPO):

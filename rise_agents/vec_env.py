@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
 from rise_agents.seeds import episode_seeds
+from rise_envs.cost import checked_cost, cost_of
 
 # From observations with a leading batch dimension to network inputs (B, K), float32.
 Encode = Callable[[Any], NDArray[np.float32]]
@@ -202,19 +203,17 @@ def step_costs(infos: dict[str, Any], dones: NDArray[np.bool_]) -> NDArray[np.fl
     """The cost (B,) of the step, for ended episodes from ``final_info``.
 
     Raises:
-        ValueError: a sub-environment reported none.
+        ValueError: a sub-environment reported none, or one that is no finite number ≥ 0.
     """
-    final = infos.get("final_info", {})
-    none = np.zeros(len(dones))
-    known = np.where(dones, final.get("_cost", none), infos.get("_cost", none)).astype(bool)
+    final, nothing = infos.get("final_info", {}), np.zeros(len(dones))
+    known = np.where(dones, final.get("_cost", nothing), infos.get("_cost", nothing)).astype(bool)
     if not known.all():
-        raise ValueError(
-            f"sub-environment {int(np.argmin(known))} gave no info['cost'] in this step: constrained "
-            "learning needs a cost (0.0 for none) in every step"
-        )
-    cost = np.where(dones, final.get("cost", none), infos.get("cost", none)).astype(np.float64)
-    if not np.isfinite(cost).all():
-        raise ValueError(f"info['cost'] must be finite, got {cost[~np.isfinite(cost)][0]}")
+        given = {key: None for key in (*infos, *final) if key != "cost" and not key.startswith("_")}
+        cost_of(given, f"sub-environment {np.argmin(known)}")
+    cost = np.where(dones, final.get("cost", nothing), infos.get("cost", nothing)).astype(np.float64)
+    valid = (cost >= 0) & (cost < np.inf)
+    if not valid.all():
+        checked_cost(cost[np.argmin(valid)], f"sub-environment {np.argmin(valid)}")
     return cost
 
 
