@@ -17,11 +17,11 @@ ID = "RISE-GroundVehicle-v0"
 MODES = list(AutoresetMode)
 
 
-def native(n: int = 5, mode: AutoresetMode = AutoresetMode.NEXT_STEP, **kwargs: Any) -> gym.vector.VectorEnv:
+def native(n: int = 5, mode: AutoresetMode = AutoresetMode.NEXT_STEP, **kwargs: Any) -> Any:
     return gym.make_vec(ID, n, autoreset_mode=mode, **kwargs)
 
 
-def reference(n: int, mode: AutoresetMode, **kwargs: Any) -> gym.vector.VectorEnv:
+def reference(n: int, mode: AutoresetMode, **kwargs: Any) -> Any:
     return gym.make_vec(ID, n, vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode}, **kwargs)
 
 
@@ -46,7 +46,7 @@ def assert_same(a: Any, b: Any, where: str = "") -> None:
         assert a == b, where
 
 
-def towards_goal(observation: dict[str, np.ndarray], rng: np.random.Generator) -> np.ndarray:
+def towards_goal(observation: dict[str, Any], rng: np.random.Generator) -> np.ndarray:
     """Actions that reach goals and now and then meet a disc, so that every kind of end occurs."""
     way = observation["desired_goal"] - observation["achieved_goal"]
     turn = np.arctan2(way[:, 1], way[:, 0]) - observation["observation"][:, 2]
@@ -55,7 +55,7 @@ def towards_goal(observation: dict[str, np.ndarray], rng: np.random.Generator) -
     return np.clip(action, [0, -1.5], [2.5, 1.5]).astype(np.float32)
 
 
-def reset_ended(env: gym.vector.VectorEnv, ended: np.ndarray) -> Any:
+def reset_ended(env: Any, ended: np.ndarray) -> Any:
     return env.reset(options={"reset_mask": ended.copy()})
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -36,7 +37,8 @@ def pixel(picture: np.ndarray, x: float, y: float, half: float = HALF) -> np.nda
 
 def like(picture: np.ndarray, colour: tuple[int, int, int], tolerance: int = 12) -> np.ndarray:
     """Where the view (without the strip of text) has about that colour, (SIZE, SIZE) bool."""
-    return (np.abs(picture[:SIZE].astype(int) - colour) <= tolerance).all(-1)
+    near: np.ndarray = np.abs(picture[:SIZE].astype(int) - colour) <= tolerance
+    return np.all(near, axis=-1)
 
 
 def middle(mask: np.ndarray) -> np.ndarray:
@@ -89,7 +91,7 @@ def test_the_disc_as_read_is_dashed_and_only_there_when_there_is_one() -> None:
     picture = scene(perceived=PERCEIVED)
     angle = np.linspace(0, 2 * np.pi, 720, endpoint=False)
     rim = np.stack([pixel(picture, -4 + 2 * np.cos(a), -6 + 2 * np.sin(a)) for a in angle])
-    dark = (np.abs(rim - rendering.READING) < 60).all(-1)
+    dark = np.all(np.abs(rim - rendering.READING) < 60, axis=-1)
     assert 0.35 < dark.mean() < 0.75
     assert (dark[1:] != dark[:-1]).sum() >= 12  # dashes, not a half circle
     filled = pixel(picture, -3.0, -5.5)
@@ -124,11 +126,11 @@ def test_absurd_readings_are_drawn_without_complaint(perceived: list[float]) -> 
 
 def test_drawing_changes_no_episode_and_needs_no_display() -> None:
     pygame.display.quit()
-    drawn = gym.make("RISE-GroundVehicle-v0", render_mode="rgb_array")
+    drawn: Any = gym.make("RISE-GroundVehicle-v0", render_mode="rgb_array")
     plain = gym.make("RISE-GroundVehicle-v0")
     drawn.reset(seed=0), plain.reset(seed=0)
     for _ in range(5):
-        drawn.unwrapped.perceived = np.zeros(5)  # type: ignore[attr-defined]
+        drawn.unwrapped.perceived = np.zeros(5)
         first, again = drawn.render(), drawn.render()
         np.testing.assert_array_equal(first, again)
         action = np.array([2.0, 0.5], np.float32)
@@ -137,11 +139,11 @@ def test_drawing_changes_no_episode_and_needs_no_display() -> None:
             np.testing.assert_array_equal(a[0][key], b[0][key])
     assert not pygame.display.get_init()
     drawn.reset()
-    assert drawn.unwrapped.perceived is None  # type: ignore[attr-defined]
+    assert drawn.unwrapped.perceived is None
 
 
 def test_rendering_without_a_mode_says_so() -> None:
-    env = gym.make("RISE-GroundVehicle-v0").unwrapped
+    env: Any = gym.make("RISE-GroundVehicle-v0").unwrapped
     env.reset(seed=0)
     with pytest.warns(UserWarning, match="render_mode='rgb_array'"):
         assert env.render() is None
@@ -160,7 +162,9 @@ def test_human_mode_opens_and_closes_a_window(no_screen: None) -> None:
     env = gym.make("RISE-GroundVehicle-v0", render_mode="human")
     env.reset(seed=0)
     assert pygame.display.get_init()
-    picture = pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
+    screen = pygame.display.get_surface()
+    assert screen is not None
+    picture = pygame.surfarray.array3d(screen).swapaxes(0, 1)
     assert picture.shape == (SIZE + STRIP, SIZE, 3)
     assert like(picture, rendering.GOAL_FILL).any()
     env.step(env.action_space.sample())
