@@ -71,9 +71,12 @@ def initial_state(policy: Any, keys: NDArray[np.uint64]) -> State:
 
 
 def merge_states(old: State, new: State, rows: NDArray[np.bool_]) -> State:
-    """``old`` with the given ``rows`` (B,) bool taken from ``new``."""
+    """``old`` with the given ``rows`` (B,) bool taken from ``new``; if one of them is None, the other one.
+
+    A policy that names no initial state begins rows anew itself, where ``episode_start`` says so.
+    """
     if old is None or new is None:
-        return new
+        return new if old is None else old
     return tuple(
         np.where(rows.reshape((-1,) + (1,) * (a.ndim - 1)), b, a) for a, b in zip(old, new, strict=True)
     )
