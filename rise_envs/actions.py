@@ -16,12 +16,14 @@ def checked_action(action: Any, space: spaces.Box) -> NDArray[np.float64]:
         ValueError: wrong shape, not numeric, or not finite. The environment's state is untouched.
     """
     try:
-        array = np.asarray(action, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ValueError(f"action must be numeric with shape {space.shape}, got {action!r}") from None
+        array = np.asarray(action)
+    except ValueError:  # rows of different lengths
+        array = np.asarray(None)
+    if array.dtype.kind not in "fiub":
+        raise ValueError(f"action must be numeric with shape {space.shape}, got {action!r}")
     if array.shape != space.shape:
         raise ValueError(f"action must have shape {space.shape}, got shape {array.shape}")
     if not np.isfinite(array).all():
         where = np.argwhere(~np.isfinite(array))[0].tolist()
         raise ValueError(f"action must be finite, got {array[tuple(where)]} at index {where}")
-    return np.clip(array, space.low, space.high)
+    return np.clip(array.astype(np.float64), space.low, space.high)

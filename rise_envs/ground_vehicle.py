@@ -79,7 +79,7 @@ class VehicleTask:
     @property
     def noise_scale(self) -> dict[str, Array]:
         """Standard deviation of the readings at noise level 1, per channel."""
-        return {"obstacle": np.ones(5 * self.n_obstacles)}
+        return {"obstacle": np.array(self.task(self.n_obstacles, self.params).noise_scale)}
 
     def compute_reward(self, achieved_goal: Array, desired_goal: Array, info: Any) -> Any:
         """Reward of one transition or of a batch: see :func:`rise_envs.goals.reward`."""
@@ -170,7 +170,9 @@ class GroundVehicleEnv(VehicleTask, gym.Env):
             raise ValueError(f"render_mode must be None, 'rgb_array' or 'human', got {render_mode!r}")
         self.render_mode = render_mode
         self.observation_space, self.action_space = make_spaces(self.n_obstacles, params)
-        self.perceived: Array | None = None  # the reading as a noise wrapper last handed it out
+        # The reading as a noise wrapper last handed it out. A window, which draws within the step, shows the
+        # one that the step's action was based on.
+        self.perceived: Array | None = None
         self._trail: list[Array] = []
         self._window: Any = None
 

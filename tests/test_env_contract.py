@@ -301,7 +301,9 @@ def test_drawing_changes_no_episode(env_id: str, expected: Any) -> None:
 # --- misuse -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("wrong", ["shape", "row", "nan", "inf", "text", "none"])
+@pytest.mark.parametrize(
+    "wrong", ["shape", "row", "ragged", "nan", "inf", "text", "digits", "complex", "none"]
+)
 def test_refused_actions_change_nothing(env: Any, twin: Any, wrong: str) -> None:
     shape = env.action_space.shape
     assert shape is not None
@@ -310,7 +312,10 @@ def test_refused_actions_change_nothing(env: Any, twin: Any, wrong: str) -> None
         "row": np.zeros((1, *shape)),
         "nan": np.full(shape, np.nan),
         "inf": np.array([np.inf] + [0.0] * (shape[0] - 1)),
+        "ragged": [[0.0], [0.0, 0.0], []][: shape[0]],
         "text": ["left"] * shape[0],
+        "digits": ["1"] * shape[0],
+        "complex": np.zeros(shape, complex),
         "none": None,
     }[wrong]
     env.reset(seed=2), twin.reset(seed=2)

@@ -9,6 +9,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy import stats
 
 import rise_envs  # noqa: F401
@@ -147,6 +149,22 @@ def test_actions_outside_the_bounds_are_clipped() -> None:
     np.testing.assert_array_equal(wild[0]["observation"], tame[0]["observation"])
     a.step([-1.0, 0.0])
     assert a.world.state[0, :2].tolist() == wild[0]["achieved_goal"].tolist()  # it has no reverse gear
+
+
+wide = st.floats(-1e6, 1e6)
+
+
+@given(st.lists(st.tuples(wide, wide), min_size=1, max_size=10), st.integers(0, 10**6))
+def test_no_action_breaks_the_limits(actions: list[tuple[float, float]], seed: int) -> None:
+    env = make()
+    before = env.reset(seed=seed)[0]["observation"]
+    for action in actions:
+        observation = env.step(action)[0]
+        assert observation in env.observation_space
+        after = observation["observation"]
+        assert np.linalg.norm(after[:2] - before[:2]) <= 0.25 + 1e-12
+        assert abs(geometry.wrap_angle(after[2] - before[2])) <= 0.15 + 1e-12
+        before = after
 
 
 def test_pinned_episode() -> None:
