@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 import safetensors.numpy as st
 
-from rise_agents import demonstrations as demos
-from rise_agents import minari_io
-from rise_agents.demonstrate import main
-from rise_agents.demonstrations import ARRAYS, CARD, DatasetError, generate, load
+from rise_agents.demonstrations import ARRAYS, CARD, DatasetError, generate, load, minari_io
+from rise_agents.demonstrations.__main__ import main
 
 VEHICLE = "RISE-GroundVehicle-v0"
 
@@ -63,7 +61,7 @@ def test_unsafe_and_unsuccessful_episodes_are_left_out_and_counted(monkeypatch):
             turn = (turn + np.pi) % (2 * np.pi) - np.pi
             return np.column_stack((np.full(len(way), 2.5), np.clip(3 * turn, -1.5, 1.5))), None
 
-    monkeypatch.setattr(demos, "make_expert", lambda *args, **kwargs: Straight())
+    monkeypatch.setattr("rise_agents.demonstrations.recording.make_expert", lambda *args, **kwargs: Straight())
     d = generate(VEHICLE, "straight", 20)
     assert len(d) == 20
     assert (d.costs == 0).all()

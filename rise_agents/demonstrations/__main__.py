@@ -75,7 +75,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             )
         made.save(a.out)
         if a.minari:
-            from rise_agents.minari_io import export
+            from rise_agents.demonstrations.minari_io import export
 
             export(made, a.minari)
     except KeyboardInterrupt:
@@ -90,3 +90,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         f"{card['tried']:,} tried, {100 * card['rejection_rate']:.2f} % rejected as unsafe or unsuccessful"
     )
     return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -8,7 +8,13 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from rise_agents.demonstrations import OBSERVATIONS, SCHEMA, DatasetError, Demonstrations, from_arrays
+from rise_agents.demonstrations.dataset import (
+    OBSERVATIONS,
+    SCHEMA,
+    DatasetError,
+    Demonstrations,
+    from_arrays,
+)
 from rise_envs.task import env_class
 
 _SEED, _EXPERT = "rise_seed", "rise_expert"
