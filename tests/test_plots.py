@@ -167,7 +167,7 @@ def test_saved_pictures_are_reproducible_and_carry_no_time(tmp_path):
 
 def test_plotting_never_loads_pyplot():
     code = "import sys, benchmarks.plots; assert 'matplotlib.pyplot' not in sys.modules"
-    subprocess.run([sys.executable, "-c", code], check=True)  # noqa: S603
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 @pytest.mark.parametrize(

@@ -76,7 +76,7 @@ def test_merging_does_not_depend_on_order_process_or_split(tmp_path):
     results.merge(paths[3::-1], tmp_path / "b.parquet")
     results.merge(paths[:3:-1], tmp_path / "c.parquet")
     code = "import sys; from benchmarks import results; results.merge(sys.argv[2:], sys.argv[1])"
-    subprocess.run([sys.executable, "-c", code, tmp_path / "d.parquet", *paths[:4]], check=True)  # noqa: S603
+    subprocess.run([sys.executable, "-c", code, tmp_path / "d.parquet", *paths[:4]], check=True)
     assert len({(tmp_path / f"{name}.parquet").read_bytes() for name in "abcd"}) == 1
     assert results.read_rows(tmp_path / "a.parquet").equals(merged)
     keys = list(zip(*(merged[key].to_pylist() for key in results.KEY), strict=True))
