@@ -62,7 +62,7 @@ class Params:
     max_offset: float = 0.06
     start_clearance: float = 0.04
     start_time: float = 0.2
-    max_hand_speed: float = 1.5
+    max_hand_speed: float = 2.0
     hand_radius: float = 0.05
     noise_scale: tuple[float, float, float] = (0.05, 0.05, 0.02)
 

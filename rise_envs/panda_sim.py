@@ -27,13 +27,13 @@ NO_LINK = -2
 _HAND_DOWN = (1.0, 0.0, 0.0, 0.0)
 _PROBE_RADIUS = 0.001  # m
 
-# When the clearance is looked at within a step. Under the wildest actions nothing on the arm comes 0.13 m nearer
-# to a sphere in one step, so that from beyond _FAR no contact is in reach and one look at the end will do; so it
-# will in the midst of a collision. Between the two, the least clearance errs by 1 mm at most against a look
-# after every substep (by 0.02 m where one look does), and a contact is never missed.
-_FAR = 0.15  # m
+# When the clearance is looked at within a step. Under the wildest actions no part of the arm goes _ARM_REACH in
+# one step, so that from beyond it no contact is possible and one look at the end will do; so it will in the midst
+# of a collision. Between the two, the least clearance errs by 1 mm at most against a look after every substep (by
+# 0.02 m where one look does), and a contact is never missed.
+_ARM_REACH = 0.14  # m
 _LOOK_EVERY = 4  # substeps; twice as many once the arm draws away
-_NEAR = 0.005  # m; nearer than this, a look after every substep
+_NEAR = 0.005  # m; nearer than this after every substep, every second one once the arm draws away
 _NEARER, _AWAY = 0.01, 0.06  # m beyond the least so far; how far the look at the end reaches, for speed
 
 Point = tuple[float, float, float]
@@ -86,6 +86,7 @@ class PandaSim:
         self._bullet = pybullet
         self._client: int = self._engine.physics_client._client
         self._arm: int = self._engine._bodies_idx[robot.body_name]
+        self._table: int = self._engine._bodies_idx["table"]
         self._neutral: list[float] = robot.neutral_joint_values.tolist()
         self._joints: list[int] = robot.joint_indices.tolist()
         self._forces: list[float] = robot.joint_forces.tolist()
@@ -137,10 +138,10 @@ class PandaSim:
             collisionShapePositionB=center,
             physicsClientId=self._client,
         )
-        if not points:
-            return np.inf, NO_LINK
-        distance, link = min((point[8], point[3]) for point in points)
-        return distance - (radius - _PROBE_RADIUS), link
+        distance, link = min(((point[8], point[3]) for point in points), default=(np.inf, NO_LINK))
+        distance -= radius - _PROBE_RADIUS
+        # Deep in a collision the engine knows no bound and may have found more than was asked for.
+        return (distance, link) if distance <= within else (np.inf, NO_LINK)
 
     def step(
         self, action: NDArray[np.float32], center: Point, velocity: Point, radius: float, start: Nearest
@@ -160,16 +161,19 @@ class PandaSim:
         self._command(action)
         (x, y, z), (u, v, w) = center, velocity
         least, advance, client = start, self._bullet.stepSimulation, self._client
-        due = _LOOK_EVERY if -_NEAR < least[0] < _FAR else N_SUBSTEPS
+        reach = _ARM_REACH + N_SUBSTEPS * SUBSTEP * (abs(u) + abs(v) + abs(w))
+        due = _LOOK_EVERY if -_NEAR < least[0] < reach else N_SUBSTEPS
         away = False
         for substep in range(1, N_SUBSTEPS):
             advance(client)
-            if substep >= due or -_NEAR < least[0] < _NEAR:
+            near = -_NEAR < least[0] < _NEAR
+            if substep >= due or (near and not away):
                 # Only what comes nearer than before matters: the rest the engine rules out at little cost.
                 t = substep * SUBSTEP
                 now = self.clearance((x + t * u, y + t * v, z + t * w), radius, within=least[0])
                 away = now > least
-                due = substep + (2 * _LOOK_EVERY if away else _LOOK_EVERY)
+                pause = _LOOK_EVERY // 2 if near else 2 * _LOOK_EVERY
+                due = substep + (pause if away else _LOOK_EVERY)
                 least = min(least, now)
         advance(client)
         self._position, self._velocity = self._read_hand()
@@ -197,6 +201,39 @@ class PandaSim:
             forces=self._forces,
             physicsClientId=self._client,
         )
+
+    def photograph(
+        self, view: Array, projection: Array, width: int, height: int, light: Array
+    ) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_]]:
+        """Arm and table as a camera sees them.
+
+        Args:
+            view: OpenGL's view matrix, (4, 4).
+            projection: OpenGL's projection matrix, (4, 4).
+            width: of the picture (px).
+            height: of the picture (px).
+            light: direction that the light comes from, (3,).
+
+        Returns:
+            Colours (H, W, 3), OpenGL's depth buffer (H, W), and where arm or table are seen (H, W).
+        """
+        _, _, colour, depth, body = self._bullet.getCameraImage(
+            width,
+            height,
+            viewMatrix=view.T.ravel().tolist(),  # OpenGL stores columns
+            projectionMatrix=projection.T.ravel().tolist(),
+            lightDirection=light.tolist(),
+            lightAmbientCoeff=0.6,
+            lightDiffuseCoeff=0.42,
+            lightSpecularCoeff=0.05,
+            shadow=0,
+            renderer=self._bullet.ER_TINY_RENDERER,
+            physicsClientId=self._client,
+        )
+        # Engines built without NumPy hand out flat tuples.
+        body = np.reshape(body, (height, width))
+        colour = np.reshape(np.asarray(colour, np.uint8), (height, width, 4))[..., :3]
+        return colour, np.reshape(depth, (height, width)), (body == self._arm) | (body == self._table)
 
     def close(self) -> None:
         """Free the engine. May be called again."""

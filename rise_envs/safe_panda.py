@@ -15,7 +15,7 @@ from rise_envs.panda_scene import DEFAULTS, Params, Sphere, candidates
 from rise_envs.task import Task
 
 if TYPE_CHECKING:
-    from rise_envs.panda_sim import Nearest, PandaSim
+    from rise_envs.panda_sim import PandaSim
 
 Array = NDArray[np.float64]
 
@@ -150,8 +150,9 @@ class SafePandaEnv(gym.Env):
         sim.reset()
         self._state, self.perceived = sim.state(), None
         self._goal, self._sphere = self._draw_start(sim, np.array([streams.draw_key(self.np_random)]))
-        self._nearest = sim.clearance(self._sphere.center, self._sphere.radius)
-        return self._observe(self._sphere), self._info(self._state[:3], self._nearest, reached=False)
+        self._least = self._nearest = sim.clearance(self._sphere.center, self._sphere.radius)
+        self._trail = [self._state[:3]]
+        return self._observe(self._sphere), self._info(self._state[:3], reached=False)
 
     def step(self, action: Any) -> tuple[dict[str, Array], float, bool, bool, dict[str, Any]]:
         """Move the arm and the sphere for one step.
@@ -161,19 +162,18 @@ class SafePandaEnv(gym.Env):
             RuntimeError: the environment is closed.
             gymnasium.error.ResetNeeded: before the first reset.
         """
-        sim, sphere = self._open_sim(), self._sphere
-        if sphere is None:
-            raise gym.error.ResetNeeded("call reset() to start an episode")
+        sim, sphere = self._open_sim(), self._started()
         commanded = checked_action(action, self.action_space).astype(np.float32)
         before = self._state[:3]
-        nearest, self._nearest = sim.step(
+        self._least, self._nearest = sim.step(
             commanded, sphere.center, sphere.velocity, sphere.radius, self._nearest
         )
         sphere.advance()
         self._state = sim.state()
         hand = self._state[:3]
+        self._trail.append(hand)
         reached = bool(goals.distance(hand, self._goal) <= self.params.goal_radius)
-        info = self._info(before, nearest, reached)
+        info = self._info(before, reached)
         reward = float(self.compute_reward(hand, self._goal, info))
         terminated = reached or (self.terminate_on_collision and info["cost"] > 0)
         return self._observe(sphere), reward, terminated, False, info
@@ -192,6 +192,34 @@ class SafePandaEnv(gym.Env):
         """Never: the time limit truncates."""
         return np.zeros(np.shape(achieved_goal)[:-1], bool)[()]
 
+    def render(self) -> NDArray[np.uint8] | None:
+        """The scene as an RGB array (480, 720, 3).
+
+        Raises:
+            RuntimeError: the environment is closed.
+            gymnasium.error.ResetNeeded: before the first reset.
+        """
+        if self.render_mode is None:
+            gym.logger.warn(
+                "render() without a render_mode: make the environment with render_mode='rgb_array'"
+            )
+            return None
+        from rise_envs import panda_rendering as drawing  # pygame is loaded by those who draw only
+
+        sim, sphere = self._open_sim(), self._started()
+        eye = drawing.camera()
+        shot = sim.photograph(eye.view, eye.projection, drawing.WIDTH, drawing.VIEW, drawing.LIGHT)
+        return drawing.draw_panda_scene(
+            shot,
+            self._goal,
+            self.params.goal_radius,
+            sphere.reading,
+            self.perceived,
+            self._trail,
+            self._least[0],
+            self.params.dt,
+        )
+
     def close(self) -> None:
         """Free the engine. May be called twice."""
         if self._sim is not None:
@@ -202,6 +230,11 @@ class SafePandaEnv(gym.Env):
         if self._sim is None:
             raise RuntimeError("this environment is closed: make a new one with gymnasium.make()")
         return self._sim
+
+    def _started(self) -> Sphere:
+        if self._sphere is None:
+            raise gym.error.ResetNeeded("call reset() to start an episode")
+        return self._sphere
 
     def _draw_start(self, sim: PandaSim, key: NDArray[np.uint64]) -> tuple[Array, Sphere]:
         """Goal and sphere of the first candidate that is fair and leaves the arm clear."""
@@ -222,8 +255,8 @@ class SafePandaEnv(gym.Env):
             "obstacle": sphere.reading,
         }
 
-    def _info(self, before: Array, nearest: Nearest, reached: bool) -> dict[str, Any]:
-        clearance, link = nearest
+    def _info(self, before: Array, reached: bool) -> dict[str, Any]:
+        clearance, link = self._least
         hit = clearance < 0
         return {
             "cost": float(hit),
