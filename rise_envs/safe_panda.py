@@ -68,7 +68,7 @@ class SafePandaEnv(gym.Env):
     y ∈ [−0.4, 0.4], z ∈ [0.05, 0.5] m where the hand can get, at least 0.25 m from it; sphere of radius 0.05
     to 0.10 m at 35–75 % of the straight way, up to 0.06 m off it along each axis, at least 0.12 m (plus its
     radius) off the goal, at least 4 cm clear of the whole arm, and so for 0.2 s at its speed. Draws that are
-    not are drawn anew. Who drives straight at the goal collides in about 93 % of episodes. `reset(seed=…)`
+    not are drawn anew. Who drives straight at the goal collides in about 92 % of episodes. `reset(seed=…)`
     replays an episode bit for bit, whatever happened before.
 
     ## End
