@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import math
 import os
 import sys
 from collections.abc import Iterator
@@ -34,7 +35,7 @@ _PROBE_RADIUS = 0.001  # m
 _ARM_REACH = 0.14  # m
 _LOOK_EVERY = 4  # substeps; twice as many once the arm draws away
 _NEAR = 0.005  # m; nearer than this after every substep, every second one once the arm draws away
-_NEARER, _AWAY = 0.01, 0.06  # m beyond the least so far; how far the look at the end reaches, for speed
+_SLACK = 0.01  # m that the look at the end reaches beyond where the arm should be, before it looks everywhere
 
 Point = tuple[float, float, float]
 Nearest = tuple[float, int]  # signed clearance (m) and the index of the link that has it
@@ -163,7 +164,7 @@ class PandaSim:
         least, advance, client = start, self._bullet.stepSimulation, self._client
         reach = _ARM_REACH + N_SUBSTEPS * SUBSTEP * (abs(u) + abs(v) + abs(w))
         due = _LOOK_EVERY if -_NEAR < least[0] < reach else N_SUBSTEPS
-        away = False
+        away = due == N_SUBSTEPS
         for substep in range(1, N_SUBSTEPS):
             advance(client)
             near = -_NEAR < least[0] < _NEAR
@@ -176,10 +177,12 @@ class PandaSim:
                 due = substep + (pause if away else _LOOK_EVERY)
                 least = min(least, now)
         advance(client)
+        before = self._position
         self._position, self._velocity = self._read_hand()
         t = N_SUBSTEPS * SUBSTEP
         last = (x + t * u, y + t * v, z + t * w)
-        end = self.clearance(last, radius, within=least[0] + (_AWAY if away else _NEARER))
+        moved = math.dist(before, self._position) if away else 0.0
+        end = self.clearance(last, radius, within=least[0] + moved + _SLACK)
         if end[1] == NO_LINK:
             end = self.clearance(last, radius)
         return min(least, end), end
