@@ -1,0 +1,332 @@
+"""The pages keep their word: snippets run, links lead somewhere, tables agree with the code, doctests pass."""
+
+from __future__ import annotations
+
+import doctest
+import importlib
+import inspect
+import re
+import runpy
+from dataclasses import fields
+from functools import reduce
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks.protocol import PRESETS, make_plan
+from benchmarks.results import SCHEMA, SummaryRow
+from benchmarks.run import parser
+from rise_agents import AGENTS, agent_class, readings
+from rise_agents.agent import make_config
+from rise_agents.cloning import CloningConfig
+from rise_agents.experts import EXPERTS
+from rise_agents.rise import Config as RiseConfig
+from rise_agents.seeds import SPLITS
+from rise_envs import ENVS, NOISE_MODELS, make_noise
+from rise_envs.task import env_class, task_of
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.glob("*.md"))]
+PICTURES = {DOCS / "images" / "vehicle.png", DOCS / "images" / "panda.png"}  # drawn from a finished run
+PACKAGES = ("rise_envs", "rise_agents", "benchmarks")
+
+_FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+_LINK = re.compile(r"\[([^\]]*)\]\(([^)\s]+)\)")
+_CODE = re.compile(r"`([^`]+)`")
+
+Table = tuple[list[str], list[list[str]]]  # header and rows, each a list of cells
+
+
+def page_id(page: Path) -> str:
+    return page.relative_to(ROOT).as_posix()
+
+
+# --- reading the pages -----------------------------------------------------------------------------------------
+
+
+def prose(page: Path) -> str:
+    """A page without its code blocks."""
+    return _FENCE.sub("", page.read_text())
+
+
+def plain(cell: str) -> str:
+    """A table cell as a reader sees it: the words of links, no backticks."""
+    return _LINK.sub(r"\1", cell).replace("`", "").strip()
+
+
+def tables(page: Path) -> list[Table]:
+    """All tables of a page, cells as written."""
+    blocks = re.findall(r"(?:^\|.*\|\n)+", prose(page) + "\n", re.MULTILINE)
+    split = [[[cell.strip() for cell in line[1:-1].split("|")] for line in b.splitlines()] for b in blocks]
+    return [(rows[0], rows[2:]) for rows in split]
+
+
+def table(page: str, *header: str) -> list[list[str]]:
+    """The rows, in plain words, of the one table of ``docs/page`` whose header begins with these cells."""
+    found = [rows for head, rows in tables(DOCS / page) if tuple(map(plain, head))[: len(header)] == header]
+    assert len(found) == 1, f"docs/{page} has {len(found)} tables that begin with the columns {header}"
+    return [[plain(cell) for cell in row] for row in found[0]]
+
+
+def columns_after(page: str, marker: str) -> list[str]:
+    """The first column of the first table after the line that begins with ``marker``."""
+    text = (DOCS / page).read_text()
+    rest = text[text.index(f"\n{marker}") :]
+    lines = re.search(r"(?:^\|.*\|\n)+", rest, re.MULTILINE)
+    assert lines is not None
+    return [plain(line.split("|")[1]) for line in lines[0].splitlines()[2:]]
+
+
+def anchors(page: Path) -> set[str]:
+    """What links to the headings of a page are called."""
+    headings = re.findall(r"^#+ (.*)$", prose(page), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", plain(h)).lower().replace(" ", "-") for h in headings}
+
+
+def member(file: Path, name: str) -> Any:
+    """``name`` (dots allowed) in the module that ``file`` is."""
+    module = ".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+    return reduce(getattr, name.split("."), importlib.import_module(module))
+
+
+# --- snippets, links, doctests ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if "```python" in p.read_text()], ids=page_id)
+def test_snippets_run(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    # The page with everything but its snippets blanked: a traceback then names the line of the page.
+    lines, inside = [], False
+    for line in page.read_text().splitlines():
+        inside = inside and line != "```"
+        lines.append(line if inside else "")
+        inside = inside or line == "```python"
+    script = tmp_path / f"{page.stem}.py"
+    script.write_text("\n".join(lines))
+    runpy.run_path(str(script))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_id)
+def test_links_lead_to_files_and_headings_that_exist(page):
+    for words, target in _LINK.findall(prose(page)):
+        if re.match(r"[a-z]+:", target):
+            continue
+        name, _, anchor = target.partition("#")
+        file = (page.parent / name).resolve() if name else page
+        assert file.exists() or file in PICTURES, f"{page_id(page)}: [{words}]({target})"
+        assert not anchor or anchor in anchors(file), f"{page_id(page)}: no heading {target}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_id)
+def test_names_that_link_to_a_module_are_in_it(page):
+    for words, target in _LINK.findall(prose(page)):
+        if target.endswith(".py") and re.fullmatch(r"`[\w.]+`", words):
+            assert member((page.parent / target).resolve(), words.strip("`")) is not None
+
+
+DOCTESTED = [
+    file
+    for package in PACKAGES
+    for file in sorted((ROOT / package).rglob("*.py"))
+    if re.search(r"^\s*>>> ", file.read_text(), re.MULTILINE)
+]
+
+
+@pytest.mark.parametrize("file", DOCTESTED, ids=page_id)
+def test_doctests(file):
+    parts = file.relative_to(ROOT).with_suffix("").parts
+    module = importlib.import_module(".".join(parts).removesuffix(".__init__"))
+    result = doctest.testmod(module)
+    assert result.attempted > 0
+    assert result.failed == 0
+
+
+# --- environments ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def environment_table() -> dict[str, list[str]]:
+    """Row name → one cell per environment, in the order of the registry."""
+    return {row[0]: row[1:] for row in table("environments.md", "", *ENVS)}
+
+
+@pytest.mark.parametrize("place", range(len(ENVS)), ids=list(ENVS))
+def test_the_table_of_environments_agrees_with_them(environment_table, place):
+    env_id, said = list(ENVS)[place], {name: cells[place] for name, cells in environment_table.items()}
+    entry, vector_entry, steps = ENVS[env_id]
+    task, env = task_of(env_id), env_class(env_id)()
+    try:
+        assert said["class"] == entry.partition(":")[2]
+        assert said["steps per episode"] == str(steps)
+        assert said["time step"] == f"{task.dt:g} s"
+        assert said["reached within"] == f"{task.goal_radius:g} m"
+        low, high = (
+            ", ".join(f"{x:g}" for x in bound) for bound in (env.action_space.low, env.action_space.high)
+        )
+        assert said["action bounds"].replace("−", "-") == f"[{low}] to [{high}]"
+        for key, space in env.observation_space.items():
+            assert said[key].startswith(f"{space.shape}: ".replace("'", "")), key
+        assert (said["batched form"] == "native") == (vector_entry is not None)
+        assert said["render_mode"].split(", ") == env.metadata["render_modes"]
+    finally:
+        env.close()
+
+
+def test_arguments_of_environments():
+    for env_id in ENVS:
+        known = inspect.signature(env_class(env_id)).parameters
+        said = {name for name, _, note in table("environments.md", "argument", "default")}
+        assert set(known) <= said
+        assert said - set(known) <= {"n_obstacles"}
+
+
+# --- noise -----------------------------------------------------------------------------------------------------
+
+
+def test_the_table_of_noise_models_agrees_with_the_registry():
+    rows = table("noise.md", "name", "parameter (default)")
+    assert [row[0] for row in rows] == list(NOISE_MODELS)
+    for name, parameter, *_ in rows:
+        default = re.search(r"\((.+)\)", parameter)
+        assert default is not None
+        assert make_noise(f"{name}:{default[1]}") == make_noise(name)
+
+
+def test_the_units_of_noise_are_those_that_environments_publish():
+    rows = table("noise.md", "environment", "position (m)")
+    assert [row[0] for row in rows] == list(ENVS)
+    for env_id, *said in rows:
+        task = task_of(env_id)
+        position, velocity, radius = task.split(np.array([task.noise_scale]))
+        for words, values in zip(said, (position, velocity, radius), strict=True):
+            assert np.all(values == float(words))
+
+
+# --- agents ----------------------------------------------------------------------------------------------------
+
+
+def test_the_table_of_agents_agrees_with_the_registry():
+    rows = table("agents.md", "name", "class", "learns from")
+    assert [row[0] for row in rows] == list(AGENTS)
+    for name, kind, source, _ in rows:
+        assert AGENTS[name].endswith(f":{kind}")
+        assert agent_class(name).learns_from in source
+
+
+def test_the_table_of_experts_agrees_with_the_registry():
+    rows = table("agents.md", "environment", "name", "class")
+    assert {(env, name): kind for env, name, kind, _ in rows} == {
+        key: path.partition(":")[2] for key, path in EXPERTS.items()
+    }
+
+
+def test_the_table_of_settings_has_every_field_and_its_default():
+    rows = table("agents.md", "setting", "default", "of")
+    shared = [field.name for field in fields(CloningConfig)]
+    assert [row[0] for row in rows] == [field.name for field in fields(RiseConfig)]
+    for name, default, of, _ in rows:
+        assert default == str(getattr(RiseConfig(), name))
+        assert of == ("rise, pcbc" if name in shared else "rise")
+        assert name not in shared or getattr(CloningConfig(), name) == getattr(RiseConfig(), name)
+
+
+def test_the_table_of_frames_has_the_sizes_of_their_inputs():
+    rows = table("agents.md", "frame", "what is seen")
+    assert [row[0] for row in rows] == list(readings.FRAMES)
+    for place, env_id in enumerate(ENVS):
+        task, env = task_of(env_id), env_class(env_id)()
+        batch = {key: np.ones((1, *space.shape)) for key, space in env.observation_space.items()}
+        env.close()
+        for frame, _, *said in rows:
+            robot, reading = readings.inputs(task, frame, batch)
+            assert said[place] == f"{robot.shape[1]} + {reading.shape[1]}"
+
+
+def paper_map() -> list[list[str]]:
+    """Rows of the paper-to-code map, cells as written."""
+    (found,) = [rows for head, rows in tables(DOCS / "agents.md") if head == ["paper", "file", "what"]]
+    return found
+
+
+@pytest.mark.parametrize("row", paper_map(), ids=lambda row: plain(row[0]))
+def test_what_the_paper_to_code_map_names_exists(row):
+    ((words, target),) = _LINK.findall(row[1])
+    file = (DOCS / target).resolve()
+    assert words == file.name
+    names = _CODE.findall(row[2])
+    assert names
+    for name in names:
+        assert member(file, name) is not None
+
+
+def test_the_map_holds_every_equation_and_every_line_of_algorithm_1():
+    lines: set[int] = set()
+    for row in paper_map():
+        if found := re.match(r"lines? (\d+)(?:–(\d+))?,", row[0]):
+            lines |= set(range(int(found[1]), int(found[2] or found[1]) + 1))
+    assert lines == set(range(1, 27))
+    equations = {int(n) for row in paper_map() for n in re.findall(r"^equation (\d)", row[0])}
+    assert equations == {1, 2, 3}
+
+
+# --- benchmark -------------------------------------------------------------------------------------------------
+
+
+def number(text: str) -> int:
+    return int(text.replace(",", ""))
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_the_table_of_presets_agrees_with_them(preset):
+    heads = [f"{name} (default)" if name == "quick" else name for name in PRESETS]
+    place = list(PRESETS).index(preset) + 1
+    said = {row[0]: row[place] for row in table("benchmark.md", "", *heads)}
+    known = PRESETS[preset]
+    plan = make_plan(preset, {}, agents=tuple(AGENTS), envs=tuple(ENVS), noise_model="step")
+
+    def setting(agent: str, env: str, field: str) -> int:
+        return getattr(make_config(agent_class(agent), env, plan.config(agent, env)), field)
+
+    assert number(said.pop("demonstrations, episodes per environment")) == known.demos
+    assert number(said.pop("test scenarios per condition")) == known.episodes
+    levels = tuple(float(level) for level in said.pop("noise levels").split(", "))
+    assert levels == known.noise_levels
+    assert number(said.pop("training seeds")) == known.seeds
+    assert number(said.pop("scenarios in a clip")) == known.clips
+    for name, agents, field in (
+        ("rise: gradient steps of stage 1", ("rise",), "vae_updates"),
+        ("rise: gradient steps of stage 2", ("rise",), "updates"),
+        ("pcbc: gradient steps", ("pcbc",), "updates"),
+        ("rise, pcbc: batch size", ("rise", "pcbc"), "batch_size"),
+    ):
+        words = said.pop(name)
+        assert {setting(agent, env, field) for agent in agents for env in ENVS} == {number(words)}
+    for env, words in zip(ENVS, ("vehicle", "Panda"), strict=True):
+        told = number(said.pop(f"cppo: environment steps, {words}"))
+        assert told == setting("cppo", env, "total_steps")
+    assert not said
+
+
+def test_the_table_of_options_has_every_option_of_the_command():
+    actions = {action.option_strings[-1]: action for action in parser()._actions}
+    rows = table("benchmark.md", "option", "default")
+    assert {row[0] for row in rows} == set(actions) - {"--help"}
+    for option, default, _ in rows:
+        value = actions[option].default
+        if isinstance(value, str):
+            assert default == value
+        elif isinstance(value, list):
+            assert default == " ".join(value)
+
+
+def test_the_table_of_seeds_agrees_with_the_splits():
+    assert {row[0]: int(row[1]) for row in table("benchmark.md", "split", "first seed")} == SPLITS
+
+
+def test_the_tables_of_columns_agree_with_the_files():
+    assert columns_after("benchmark.md", "`episodes.parquet`:") == SCHEMA.names
+    assert columns_after("benchmark.md", "`summary.csv` (") == [field.name for field in fields(SummaryRow)]
