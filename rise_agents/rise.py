@@ -100,7 +100,7 @@ def policy_loss(
     epsilon: Tensor,
     kind: str,
 ) -> dict[str, Tensor]:
-    """The loss of stage 2, averaged over M posterior samples (Algorithm 1, lines 14 to 19).
+    """The loss of stage 2, averaged over M posterior samples (Algorithm 1, lines 16 to 22).
 
     Args:
         policy: π_θ on (s, g, z).
@@ -158,8 +158,9 @@ class Rise:
         self._fit_vae(vae, data, ratio, generator, lambda done, figures: progress(share * done, figures))
         with torch.no_grad():
             mu, log_sigma = vae.encoder(data.reading)
-        # Stage 2 sees the latent with unit scale, which only renames its axes.
-        spread = mu.std(0).clamp_min(1e-6)
+        # Stage 2 sees samples of the latent with unit scale, which only renames its axes. The scale is that of
+        # the samples, not of their means: where the posterior falls back to the prior all means coincide.
+        spread = (mu.var(0) + (2 * log_sigma).exp().mean(0)).sqrt()
         width = data.robot.shape[1] + c.latent
         policy = mlp(width, c.hidden, cloning.output_size(data.action.shape[1], c.loss)).to(self.device)
         self._fit_policy(
