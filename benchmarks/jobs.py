@@ -1,7 +1,8 @@
 """The pieces of work of a run. A job is a pure function of its arguments that ends by writing its output file.
 
 A job whose output exists is done, whoever did it and whenever: that is all there is to resuming. File names
-carry a digest of everything the file depends on, so changed settings never meet old results.
+carry a digest of the version and of all settings that the file depends on, so changed settings never meet old
+results.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import Any
 
 from benchmarks import results
 from benchmarks.policies import make_policy
-from benchmarks.protocol import Plan, Scenarios, digest
+from benchmarks.protocol import Plan, Scenarios, digest, imitates
 from benchmarks.videos import record
 from rise_agents import AGENTS, __version__, agent_class, demonstrations, make_agent
 from rise_agents.agent import Progress, make_config, silent
@@ -53,11 +54,6 @@ def checkpoint_path(plan: Plan, env: str, agent: str, seed: int, out: Path) -> P
     source = [plan.expert, plan.demos] if imitates(agent) else []
     mark = digest(__version__, env, agent, seed, plan.config(agent, env), source)
     return out / "agents" / env / f"{agent}-seed{seed}-{mark}.rise"
-
-
-def imitates(agent: str) -> bool:
-    """Whether an agent learns from demonstrations."""
-    return agent_class(agent).learns_from == "demonstrations"
 
 
 def training_jobs(plan: Plan, out: Path, device: str) -> list[Job]:

@@ -22,8 +22,16 @@ _NOISE = {
 }
 
 
+def is_reference(row: str) -> bool:
+    """Whether a row of the tables is one to compare with: chance, or an expert (``expert``, ``expert-cbf``, …)."""
+    return row.split("-")[0] in REFERENCES
+
+
 def agent_label(name: str) -> str:
-    """The usual spelling of an agent's name; unknown names stay as they are."""
+    """The usual spelling of an agent's name: "RISE", "Expert (cbf)"; unknown names stay as they are."""
+    kind, _, which = name.partition("-")
+    if kind == "expert" and which:
+        return f"Expert ({which})"
     return _AGENTS.get(name, name)
 
 
@@ -72,6 +80,6 @@ def count(values: Iterable[int], noun: str) -> str:
 def sample(rows: Sequence[SummaryRow], mark: str) -> str:
     """How much evidence a ``mark`` stands for: "5,000 episodes per bar of 5 training seeds"."""
     # Reference rows are not trained: they say nothing about training seeds.
-    seeds = {row.train_seeds for row in rows if row.agent not in REFERENCES} or {1}
+    seeds = {row.train_seeds for row in rows if not is_reference(row.agent)} or {1}
     trained = "" if seeds == {1} else f" of {count(seeds, 'training seed')}"
     return f"{count([row.episodes for row in rows], 'episode')} per {mark}{trained}"

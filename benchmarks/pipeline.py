@@ -18,12 +18,11 @@ from benchmarks.jobs import (
     demonstrations_folder,
     evaluation_jobs,
     generate_demonstrations,
-    imitates,
     training_jobs,
     video_jobs,
 )
 from benchmarks.labels import env_label
-from benchmarks.protocol import Plan
+from benchmarks.protocol import Plan, imitates
 from rise_agents import AGENTS, agent_class, checkpoint, demonstrations
 from rise_agents.agent import config_to_dict, make_config
 

@@ -14,11 +14,11 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 
 from benchmarks.labels import (
-    REFERENCES,
     agent_label,
     condition_label,
     env_label,
     interval,
+    is_reference,
     noise_label,
     percent,
     sample,
@@ -221,7 +221,7 @@ def _beside(axis: Axes, place: float, points: float, words: str, **style: Any) -
 def _line_style(agents: Sequence[str], agent: str) -> dict:
     """Colour, marker and dashes of an agent's line; references are dashed, so that agents stand out."""
     marker = _MARKERS[agents.index(agent) % len(_MARKERS)]
-    dashes = "--" if agent in REFERENCES else "-"
+    dashes = "--" if is_reference(agent) else "-"
     return {
         "color": colour(agents, agent),
         "marker": marker,

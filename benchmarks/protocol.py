@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 from benchmarks.labels import REFERENCES
-from rise_agents import AGENTS
+from rise_agents import AGENTS, agent_class
 from rise_agents.agent import nearest
 from rise_agents.experts import expert_names
 from rise_agents.rollout import is_batched_env
@@ -67,7 +67,7 @@ PRESETS = {
             "pcbc": _BRIEF,
             "rise": {**_BRIEF, "vae_updates": 300, "vae_batch_size": 64},
             "cppo": {"total_steps": 2_048},
-            "cppo@RISE-SafePanda-v0": {"total_steps": 1_024},
+            "cppo@RISE-SafePanda-v0": {"n_envs": 4, "batch_size": 512},
         },
     ),
     "quick": Preset(demos=1_000, episodes=1_000, noise_levels=(0.0, 0.5, 1.0, 2.0), seeds=1),
@@ -111,7 +111,8 @@ class Plan:
             _known("agent", name, [*AGENTS, *REFERENCES])
         for env in self.envs:
             _known("environment", env, ENVS)
-            _known("expert", self.expert, expert_names(env))
+            if any(name == "expert" or (name in AGENTS and imitates(name)) for name in self.agents):
+                _known("expert", self.expert, expert_names(env))
         _whole("episodes", self.episodes, 1, 1_000_000)
         _whole("demos", self.demos, 1, 500_000)
         _whole("seeds", self.seeds, 1, RUNS)
@@ -142,6 +143,11 @@ class Plan:
         """The scenarios in the portions that jobs take: fixed, so that workers do not change results."""
         size = 1_000 if is_batched_env(env) else 100
         return [Scenarios(at, min(size, self.episodes - at)) for at in range(0, self.episodes, size)]
+
+
+def imitates(agent: str) -> bool:
+    """Whether an agent learns from demonstrations."""
+    return agent_class(agent).learns_from == "demonstrations"
 
 
 def _known(kind: str, name: str, known: Iterable[str]) -> None:

@@ -148,3 +148,9 @@ def draw_state(
         keys = np.where(starts, streams.bits(keys, counter), keys)
         counter = np.where(starts, np.uint64(0), counter)
     return keys, counter
+
+
+def require_widths(name: str, widths: tuple[Any, ...]) -> None:
+    """Raise ``ValueError`` unless a setting holds the widths of at least one layer."""
+    fits = len(widths) > 0 and all(type(width) is int and width >= 1 for width in widths)
+    require(fits, f"{name} must hold whole numbers of at least 1, one for each layer", widths)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from rise_agents import checkpoint, readings
-from rise_agents.agent import config_to_dict, require
+from rise_agents.agent import config_to_dict, require, require_widths
 from rise_agents.demonstrations import Demonstrations
 from rise_agents.readings import Standardiser
 from rise_envs.task import Task, env_class, task_of
@@ -34,7 +34,7 @@ class CloningConfig:
         updates: gradient steps of the policy.
         batch_size: transitions per step.
         learning_rate: of Adam, decayed to zero by a cosine.
-        transitions: use only the first so many transitions (None: all).
+        transitions: use only the first whole episodes with at most so many transitions (0: all).
     """
 
     frame: str = "body"
@@ -43,20 +43,18 @@ class CloningConfig:
     updates: int = 20_000
     batch_size: int = 256
     learning_rate: float = 1e-3
-    transitions: int | None = None
+    transitions: int = 0
 
     def __post_init__(self) -> None:
         require(self.frame in readings.FRAMES, f"frame must be one of {readings.FRAMES}", self.frame)
         require(self.loss in LOSSES, f"loss must be one of {LOSSES}", self.loss)
-        require(all(width >= 1 for width in self.hidden), "hidden must hold positive widths", self.hidden)
+        require_widths("hidden", self.hidden)
         for name in ("updates", "batch_size"):
             require(getattr(self, name) >= 1, f"{name} must be at least 1", getattr(self, name))
-        require(self.learning_rate > 0, "learning_rate must be positive", self.learning_rate)
         require(
-            self.transitions is None or self.transitions >= 1,
-            "transitions must be positive",
-            self.transitions,
+            0 < self.learning_rate < np.inf, "learning_rate must be positive and finite", self.learning_rate
         )
+        require(self.transitions >= 0, "transitions must not be negative", self.transitions)
 
 
 @dataclass(frozen=True)
@@ -69,7 +67,9 @@ class ActionUnits:
     @classmethod
     def of(cls, env_id: str) -> ActionUnits:
         """The bounds of a registered environment's actions."""
-        space = env_class(env_id)(render_mode=None).action_space
+        env = env_class(env_id)()
+        space = env.action_space
+        env.close()
         return cls(space.low.astype(np.float64), space.high.astype(np.float64))
 
     def to_unit(self, action: NDArray) -> NDArray[np.float64]:
@@ -122,13 +122,10 @@ class Eyes:
         return cls(task, frame, robot, reading)
 
 
-def prepare(
-    demonstrations: Demonstrations, eyes: Eyes, units: ActionUnits, limit: int | None, device: str
-) -> CloningData:
+def prepare(demonstrations: Demonstrations, eyes: Eyes, units: ActionUnits, device: str) -> CloningData:
     """Demonstrations on the training device, all at once."""
-    rows = slice(None if limit is None else min(limit, len(demonstrations.actions)))
-    observations = {key: value[rows] for key, value in demonstrations.observations.items()}
-    parts = (*eyes(observations), units.to_unit(demonstrations.actions[rows]).astype(np.float32))
+    action = units.to_unit(demonstrations.actions).astype(np.float32)
+    parts = (*eyes(demonstrations.observations), action)
     return CloningData(*(torch.from_numpy(part).to(device) for part in parts))
 
 
@@ -159,8 +156,8 @@ def seeded(seed: int, device: str) -> torch.Generator:
     return torch.Generator(device=device).manual_seed(seed)
 
 
-def check_source(source: Any, env_id: str, name: str) -> Demonstrations:
-    """``source`` as demonstrations of the agent's own environment.
+def check_source(source: Any, env_id: str, name: str, transitions: int) -> Demonstrations:
+    """``source`` as demonstrations of the agent's own environment, cut to at most ``transitions`` (0: all).
 
     Raises:
         ValueError: something else, or demonstrations of another environment.
@@ -169,7 +166,7 @@ def check_source(source: Any, env_id: str, name: str) -> Demonstrations:
         raise ValueError(f"{name} learns from Demonstrations, got {type(source).__name__}")
     if source.env_id != env_id:
         raise ValueError(f"{name} for {env_id!r} was given demonstrations of {source.env_id!r}")
-    return source
+    return source.within(transitions) if transitions else source
 
 
 def save(path: str | os.PathLike[str], agent: Any, arrays: dict[str, NDArray]) -> None:

@@ -50,7 +50,7 @@ from rise_agents.vec_env import (
 from rise_envs.task import Task
 
 FRAMES = (*readings.FRAMES, "raw")
-_STATISTICS_SAMPLES = 4096  # observations that the units of the inputs are taken from
+_STATISTICS_SAMPLES = 2048  # observations that the units of the inputs are taken from
 
 
 @dataclass(frozen=True)

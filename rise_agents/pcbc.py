@@ -47,11 +47,11 @@ class PCBC:
 
     def learn(self, source: Any, progress: Progress = silent) -> PCBC:
         """Clone :class:`rise_agents.demonstrations.Demonstrations`."""
-        demonstrations = cloning.check_source(source, self.env_id, self.name)
         c = self.config
+        demonstrations = cloning.check_source(source, self.env_id, self.name, c.transitions)
         generator = cloning.seeded(self.seed, self.device)
         eyes = Eyes.fit(self.task, c.frame, demonstrations)
-        data = cloning.prepare(demonstrations, eyes, self.units, c.transitions, self.device)
+        data = cloning.prepare(demonstrations, eyes, self.units, self.device)
         width = data.robot.shape[1] + data.reading.shape[1]
         policy = mlp(width, c.hidden, cloning.output_size(data.action.shape[1], c.loss)).to(self.device)
         fit(

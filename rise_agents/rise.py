@@ -27,7 +27,16 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from rise_agents import cloning, readings
-from rise_agents.agent import Progress, State, draw_state, fresh_state, make_config, require, silent
+from rise_agents.agent import (
+    Progress,
+    State,
+    draw_state,
+    fresh_state,
+    make_config,
+    require,
+    require_widths,
+    silent,
+)
 from rise_agents.cloning import ActionUnits, CloningConfig, CloningData, Eyes
 from rise_agents.networks import LOG_SIGMA_RANGE, Encoder, gaussian_kl, mlp, reparameterise
 from rise_agents.training import Forward, fit, to_arrays
@@ -58,13 +67,10 @@ class Config(CloningConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(self.beta >= 0, "beta must not be negative", self.beta)
-        require(
-            all(w >= 1 for w in self.encoder_hidden), "encoder_hidden must hold widths", self.encoder_hidden
-        )
+        require(0 <= self.beta < np.inf, "beta must not be negative, nor infinite", self.beta)
+        require_widths("encoder_hidden", self.encoder_hidden)
         for name in ("latent", "n_samples", "vae_updates", "vae_batch_size", "average"):
             require(getattr(self, name) >= 1, f"{name} must be at least 1", getattr(self, name))
-        require(len(self.encoder_hidden) >= 1, "encoder_hidden needs a layer", self.encoder_hidden)
 
 
 class VAE(nn.Module):
@@ -141,11 +147,11 @@ class Rise:
 
     def learn(self, source: Any, progress: Progress = silent) -> Rise:
         """Algorithm 1 on :class:`rise_agents.demonstrations.Demonstrations`."""
-        demonstrations = cloning.check_source(source, self.env_id, self.name)
         c = self.config
+        demonstrations = cloning.check_source(source, self.env_id, self.name, c.transitions)
         generator = cloning.seeded(self.seed, self.device)
         eyes = Eyes.fit(self.task, c.frame, demonstrations)
-        data = cloning.prepare(demonstrations, eyes, self.units, c.transitions, self.device)
+        data = cloning.prepare(demonstrations, eyes, self.units, self.device)
         # Standard units → units of the reading noise: what the decoder answers in.
         sample = demonstrations.subsample(20_000)
         noise = readings.reading_units(self.task, c.frame, sample)

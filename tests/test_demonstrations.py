@@ -61,7 +61,9 @@ def test_unsafe_and_unsuccessful_episodes_are_left_out_and_counted(monkeypatch):
             turn = (turn + np.pi) % (2 * np.pi) - np.pi
             return np.column_stack((np.full(len(way), 2.5), np.clip(3 * turn, -1.5, 1.5))), None
 
-    monkeypatch.setattr("rise_agents.demonstrations.recording.make_expert", lambda *args, **kwargs: Straight())
+    monkeypatch.setattr(
+        "rise_agents.demonstrations.recording.make_expert", lambda *args, **kwargs: Straight()
+    )
     d = generate(VEHICLE, "straight", 20)
     assert len(d) == 20
     assert (d.costs == 0).all()
@@ -79,6 +81,9 @@ def test_first_and_subsample(vehicle_demonstrations):
     part = vehicle_demonstrations.first(3)
     assert len(part) == 3
     assert len(part.actions) == part.offsets[-1] == vehicle_demonstrations.offsets[3]
+    some = vehicle_demonstrations.within(200)
+    assert len(some.actions) <= 200 < vehicle_demonstrations.offsets[len(some) + 1]
+    assert len(vehicle_demonstrations.within(1)) == 1
     assert len(vehicle_demonstrations.subsample(10)["obstacle"]) <= 10
 
 
@@ -98,6 +103,8 @@ def _forge(folder, change):
         (lambda a, c: a["actions"].__setitem__((0, 0), np.nan), "actions.*not finite.*row 0"),
         (lambda a, c: a["actions"].__setitem__((3, 1), 9.0), "actions leaves the bounds.*row 3"),
         (lambda a, c: a["costs"].__setitem__(5, 1.0), "not safe"),
+        (lambda a, c: a["final.achieved_goal"].__setitem__(2, 0.5), "episode 2 does not end at its goal"),
+        (lambda a, c: a["expert"].__setitem__(0, 3), "expert"),
         (lambda a, c: a["offsets"].__setitem__(-1, 7), "offsets"),
         (lambda a, c: a.update(rewards=a["rewards"][:-1].copy()), "rewards"),
         (lambda a, c: a.pop("observations.obstacle"), "observations.obstacle"),

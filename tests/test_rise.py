@@ -162,8 +162,19 @@ def test_decoder_answers_in_units_of_the_reading_noise(trained, vehicle_demonstr
         ("frame", "moon"),
         ("loss", "mae"),
         ("learning_rate", 0.0),
+        ("hidden", ("a",)),
+        ("transitions", "x"),
     ],
 )
 def test_settings_out_of_range_are_refused(setting, value):
     with pytest.raises(ValueError, match=setting):
         make_agent("rise", VEHICLE, {setting: value})
+
+
+def test_a_collapsed_latent_reaches_the_policy_with_unit_scale(vehicle_demonstrations):
+    """With β so large that the posterior is the prior, what the policy sees is N(0, 1), not noise blown up."""
+    agent = make_agent("rise", VEHICLE, {**BRIEF, "beta": 1e4, "vae_updates": 400}).learn(
+        vehicle_demonstrations
+    )
+    mu, sigma = agent.encode(agent._eyes(vehicle_demonstrations.observations)[1])
+    np.testing.assert_allclose(np.sqrt(mu.var(0) + (sigma**2).mean(0)), 1.0, rtol=1e-3)

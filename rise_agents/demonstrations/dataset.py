@@ -67,6 +67,10 @@ class Demonstrations:
         step = max(1, -(-len(self.actions) // rows))
         return {key: value[::step] for key, value in self.observations.items()}
 
+    def within(self, transitions: int) -> Demonstrations:
+        """The first whole episodes with at most ``transitions`` transitions, and at least one episode."""
+        return self.first(max(1, int(np.searchsorted(self.offsets, transitions, side="right")) - 1))
+
     def first(self, episodes: int) -> Demonstrations:
         """The first ``episodes`` episodes."""
         episodes = min(episodes, len(self))
@@ -159,6 +163,13 @@ def check(d: Demonstrations) -> None:
         _check_rows("actions", d.actions, total, env.action_space)
         if d.rewards.shape != (total,) or not np.isfinite(d.rewards).all():
             raise DatasetError("rewards are not one finite number for each transition")
+        last = env.compute_terminated(
+            d.final["achieved_goal"], d.final["desired_goal"], [{"cost": 0.0}] * episodes
+        )
+        if not np.all(last):
+            raise DatasetError(f"episode {np.argmin(last)} does not end at its goal")
+        if ((d.expert < 0) | (d.expert >= len(d.card.get("experts", range(1 << 30))))).any():
+            raise DatasetError("expert holds a number that no expert on the card has")
         if d.costs.shape != (total,) or (d.costs != 0).any():
             raise DatasetError("costs are not zero throughout: an episode is not safe")
     finally:

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import is_dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rise_agents.agent import config_to_dict
 from rise_agents.checkpoint import versions
 from rise_agents.demonstrations.dataset import OBSERVATIONS, Demonstrations
 from rise_agents.experts import make_expert
 from rise_agents.rollout import Transitions, policy_keys, rollout
 from rise_agents.seeds import PER_RUN, episode_seeds
 from rise_agents.workers import make_pool
+from rise_envs.task import env_class
 
 CHUNK = 50  # candidate episodes per job, at most
 
@@ -90,6 +93,14 @@ def _ordered(env_id: str, expert: str, episodes: int, seed: int, workers: int) -
             pool.shutdown(cancel_futures=True)
 
 
+def _params(env_id: str) -> dict[str, Any]:
+    """The constants of the environment, where it publishes them."""
+    env = env_class(env_id)()
+    env.close()
+    params = getattr(env, "params", None)
+    return config_to_dict(params) if is_dataclass(params) else {}
+
+
 def _assemble(env_id: str, expert: str, episodes: int, seed: int, parts: list) -> Demonstrations:
     """The first ``episodes`` good episodes of ordered chunks."""
     good = np.concatenate([reached for _, reached, _, _ in parts])
@@ -113,6 +124,7 @@ def _assemble(env_id: str, expert: str, episodes: int, seed: int, parts: list) -
         "seed": seed,
         "split": "train",
         "env_kwargs": {},
+        "params": _params(env_id),
         "episodes": len(needed),
         "transitions": int(rows.sum()),
         "tried": tried,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -43,19 +44,19 @@ def check_steering(steering: Steering) -> None:
 
 
 @njit(cache=True)
-def _act(state: Array, goal: Array, reading: Array, side: Array, t: Steering, action: Array) -> None:
-    """Write actions (B, 3) for states (B, 13), goals (B, 3), readings (B, 7); update the sides (B, 3)."""
-    arm, program, actions = make_arm(), make_program(), np.empty((t.horizon, 3))
+def _act(state: Array, goal: Array, reading: Array, t: Steering, action: Array) -> None:
+    """Write actions (B, 3) for states (B, 13), goals (B, 3) and readings (B, 7)."""
+    arm, program, actions, side = make_arm(), make_program(), np.empty((t.horizon, 3)), np.empty(3)
     for b in range(len(state)):
         q, velocity = state[b, 6:].copy(), state[b, 3:6].copy()
         scene = Scene(goal[b].copy(), reading[b, :3].copy(), DT * reading[b, 3:6], reading[b, 6])
-        choose_side(q, velocity, scene, side[b], t, arm, program, actions)
+        choose_side(q, velocity, scene, side, t, arm, program, actions)
         look(q, scene.center, arm)
-        steer(velocity, scene, side[b], t, arm, program, action[b])
+        steer(velocity, scene, side, t, arm, program, action[b])
 
 
 class PandaCBF:
-    """The expert. It is deterministic and reads the observation only.
+    """The expert: memoryless, deterministic, reads the observation only.
 
     Args:
         task: description of the Panda task.
@@ -66,32 +67,22 @@ class PandaCBF:
     def __init__(self, task: Task, seed: int = 0, config: Config = Config()) -> None:
         self.task, self.config = task, config
 
-    def initial_state(self, keys: NDArray[np.uint64]) -> tuple[Array, ...]:
-        """The state at the start of the episodes with the given keys (B,): no side taken yet, (B, 3)."""
-        return (np.zeros((len(keys), 3)),)
-
     def predict(
         self,
         observation: Mapping[str, Array],
-        state: tuple[Array, ...] | None = None,
+        state: Any = None,
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = True,
-    ) -> tuple[Array, tuple[Array, ...]]:
-        """Actions, (3,) or (B, 3), and the passing sides (B, 3), to be handed in again at the next step."""
+    ) -> tuple[Array, None]:
+        """Actions, (3,) or (B, 3), and None: the expert keeps no state."""
         rows, single = as_batch(observation)
-        goal = np.ascontiguousarray(rows["desired_goal"])
-        side = fresh_rows(state, 0, (len(goal), 3), episode_start)
+        own, goal, reading = packed(rows)
         action = np.empty((len(goal), 3))
-        reading = np.ascontiguousarray(rows["obstacle"])
-        _act(np.ascontiguousarray(rows["observation"]), goal, reading, side, self.config.steering, action)
-        return (action[0] if single else action), (side,)
+        _act(own, goal, reading, self.config.steering, action)
+        return (action[0] if single else action), None
 
 
-def fresh_rows(
-    state: tuple[Array, ...] | None, which: int, shape: tuple[int, ...], start: NDArray[np.bool_] | None
-) -> Array:
-    """A copy of array number ``which`` of the state, or zeros, with zeros in the rows that ``start`` (B,)."""
-    array = np.zeros(shape) if state is None else np.array(state[which], dtype=np.float64)
-    if start is not None:
-        array[np.asarray(start, dtype=bool).reshape(-1)] = 0.0
-    return array
+def packed(rows: Mapping[str, Array]) -> tuple[Array, Array, Array]:
+    """States (B, 13), goals (B, 3) and readings (B, 7) of a batch of observations, contiguous."""
+    own, goal, reading = (np.ascontiguousarray(rows[k]) for k in ("observation", "desired_goal", "obstacle"))
+    return own, goal, reading

@@ -13,14 +13,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from rise_agents.experts.batch import as_batch
-from rise_agents.experts.panda_cbf import check_steering, fresh_rows
+from rise_agents.experts.panda_cbf import check_steering, packed
 from rise_agents.experts.panda_model import DT, Arm, Scene, advance, look, make_arm
 from rise_agents.experts.panda_steering import Steering, choose_side, make_program
 from rise_envs import streams
@@ -45,12 +45,12 @@ class Search(NamedTuple):
         intrusion: price of a metre of missing clearance, in metres of distance to the goal.
         ending: weight of the distance to the goal at the end.
         loyalty: price of the squared deviation of the knots from the plan (m).
-        change: price of the squared change of the action from knot to knot and from the last step (m).
+        change: price of the squared change from knot to knot (m).
     """
 
     spread: float = 0.3
     elites: int = 8
-    clear: float = 0.03
+    clear: float = 0.05
     intrusion: float = 10.0
     ending: float = 3.0
     loyalty: float = 0.02
@@ -82,16 +82,14 @@ def _to_ball(knots: Array) -> None:
 
 
 @njit(cache=True)
-def _price(
-    q: Array, velocity: Array, scene: Scene, knots: Array, plan: Array, last: Array, p: Search, arm: Arm
-) -> float:
+def _price(q: Array, velocity: Array, scene: Scene, knots: Array, plan: Array, p: Search, arm: Arm) -> float:
     """Cost (m) of a sequence of knots (N_KNOTS, 3) on the motion model."""
     q, velocity, center, action = q.copy(), velocity.copy(), scene.center.copy(), np.empty(3)
     price = 0.0
     for i in range(N_KNOTS):
         for r in range(3):
-            before = knots[i - 1, r] if i > 0 else last[r]
-            price += p.loyalty * (knots[i, r] - plan[i, r]) ** 2 + p.change * (knots[i, r] - before) ** 2
+            price += p.loyalty * (knots[i, r] - plan[i, r]) ** 2
+            price += p.change * (knots[i, r] - knots[max(i - 1, 0), r]) ** 2
     for step in range(N_STEPS + 1):
         look(q, center, arm)
         away = 0.0
@@ -132,9 +130,7 @@ def _refit(tried: Array, prices: Array, elites: int, mean: Array, spread: Array)
 
 
 @njit(cache=True)
-def _search(
-    q: Array, velocity: Array, scene: Scene, knots: Array, last: Array, p: Search, table: Array, arm: Arm
-) -> None:
+def _search(q: Array, velocity: Array, scene: Scene, knots: Array, p: Search, table: Array, arm: Arm) -> None:
     """Improve the knots (N_KNOTS, 3) of a plan by cross-entropy search, in place."""
     samples = table.shape[1]
     plan, spread = knots.copy(), np.full(knots.shape, p.spread)
@@ -145,40 +141,33 @@ def _search(
                 for r in range(3):
                     tried[j, i, r] = knots[i, r] + spread[i, r] * table[k, j, i, r]
             _to_ball(tried[j])
-            prices[j] = _price(q, velocity, scene, tried[j], plan, last, p, arm)
+            prices[j] = _price(q, velocity, scene, tried[j], plan, p, arm)
         _refit(tried, prices, p.elites, knots, spread)
 
 
 @njit(cache=True)
 def _act(
-    state: Array,
-    goal: Array,
-    reading: Array,
-    side: Array,
-    last: Array,
-    t: Steering,
-    p: Search,
-    table: Array,
-    action: Array,
+    state: Array, goal: Array, reading: Array, t: Steering, p: Search, table: Array, action: Array
 ) -> None:
-    """Write actions (B, 3); update the sides (B, 3). ``last`` (B, 3) holds the actions of the step before."""
-    arm, program, actions, plan = make_arm(), make_program(), np.empty((t.horizon, 3)), np.empty((N_KNOTS, 3))
+    """Write actions (B, 3) for states (B, 13), goals (B, 3) and readings (B, 7)."""
+    arm, program, actions = make_arm(), make_program(), np.empty((t.horizon, 3))
+    side, knots = np.empty(3), np.empty((N_KNOTS, 3))
     for b in range(len(state)):
         q, velocity = state[b, 6:].copy(), state[b, 3:6].copy()
         scene = Scene(goal[b].copy(), reading[b, :3].copy(), DT * reading[b, 3:6], reading[b, 6])
-        clear = choose_side(q, velocity, scene, side[b], t, arm, program, actions)
+        clear = choose_side(q, velocity, scene, side, t, arm, program, actions)
         for i in range(N_KNOTS):
             for r in range(3):
-                plan[i, r] = actions[KNOT_STEPS[i], r]
+                knots[i, r] = actions[KNOT_STEPS[i], r]
         if not clear:
-            _to_ball(plan)
-            _search(q, velocity, scene, plan, last[b], p, table, arm)
+            _to_ball(knots)
+            _search(q, velocity, scene, knots, p, table, arm)
         for r in range(3):
-            action[b, r] = plan[0, r]
+            action[b, r] = knots[0, r]
 
 
 class PandaMPC:
-    """The expert. It reads the observation only.
+    """The expert: memoryless, reads the observation only.
 
     Args:
         task: description of the Panda task.
@@ -193,24 +182,16 @@ class PandaMPC:
         table[:, 0] = 0.0  # the mean itself is a sample
         self._table = table
 
-    def initial_state(self, keys: NDArray[np.uint64]) -> tuple[Array, ...]:
-        """The state at the start of the episodes with the given keys (B,): no side, no action yet, (B, 3) each."""
-        return np.zeros((len(keys), 3)), np.zeros((len(keys), 3))
-
     def predict(
         self,
         observation: Mapping[str, Array],
-        state: tuple[Array, ...] | None = None,
+        state: Any = None,
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = True,
-    ) -> tuple[Array, tuple[Array, ...]]:
-        """Actions, (3,) or (B, 3), and the state for the next step: sides and last actions, (B, 3) each."""
+    ) -> tuple[Array, None]:
+        """Actions, (3,) or (B, 3), and None: the expert keeps no state."""
         rows, single = as_batch(observation)
-        goal = np.ascontiguousarray(rows["desired_goal"])
-        side = fresh_rows(state, 0, (len(goal), 3), episode_start)
-        last = fresh_rows(state, 1, (len(goal), 3), episode_start)
+        own, goal, reading = packed(rows)
         action = np.empty((len(goal), 3))
-        own, reading = np.ascontiguousarray(rows["observation"]), np.ascontiguousarray(rows["obstacle"])
-        c = self.config
-        _act(own, goal, reading, side, last, c.steering, c.search, self._table, action)
-        return (action[0] if single else action), (side, action)
+        _act(own, goal, reading, self.config.steering, self.config.search, self._table, action)
+        return (action[0] if single else action), None

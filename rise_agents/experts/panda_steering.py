@@ -6,8 +6,9 @@ the table and of the arm's reach allow. For a capsule at distance d from the sph
 d − margin be at least (1 − decay)·(d − margin) after the step. The wanted action heads for the goal and, near
 the sphere, along the sphere's surface.
 
-On which side is decided by `choose_side`: roll-outs of `steer` itself on the motion model, one per side, with
-a bonus for the side already taken. Both experts follow that choice, so that they agree on it.
+On which side is decided by `choose_side`: roll-outs of `steer` itself on the motion model, one per side, afresh
+in every step. Both experts follow that choice, so that they agree on it. Neither keeps a memory: sticking to a
+side once taken made the actions several times harder to imitate, and reached the goal no more often.
 
 SI units. Compiled with numba, for one arm.
 """
@@ -44,21 +45,19 @@ class Steering(NamedTuple):
         slow_down: distance to the goal within which the wanted action shrinks (m).
         penalty: price of breaking a barrier, per unit of action.
         horizon: steps of a roll-out.
-        stay: bonus of the side already taken (m of mean distance to the goal).
     """
 
     decay: float = 0.3
-    margin: float = 0.02
+    margin: float = 0.04
     watch: float = 0.20
     turn_far: float = 0.15
     turn_near: float = 0.03
-    turn: float = 0.9
+    turn: float = 0.6
     floor: float = 0.02
     reach: float = 0.73
     slow_down: float = 0.06
     penalty: float = 50.0
     horizon: int = 16
-    stay: float = 0.02
 
 
 class Program(NamedTuple):
@@ -246,30 +245,37 @@ def choose_side(
     program: Program,
     actions: Array,
 ) -> bool:
-    """Replace ``side`` (3,) by the one with the cheapest roll-out; ``actions`` (horizon, 3) receives that.
+    """Find the side with the cheapest roll-out, in place.
 
-    Compared are no side, the present one (with a bonus), and directions around the way to the goal. While the
-    straight way keeps clear of the sphere, there is nothing to choose: then it returns True.
+    Compared are no side and directions around the way to the goal. While the straight way keeps clear of the
+    sphere, there is nothing to choose.
+
+    Args:
+        q: joint angles (rad), (7,).
+        velocity: of the hand (m/s), (3,).
+        scene: goal and sphere.
+        side: receives the direction, (3,); zero for none.
+        t: tunables.
+        arm: scratch.
+        program: scratch.
+        actions: receives the actions of that roll-out, (horizon, 3).
+
+    Returns:
+        Whether the straight way is clear.
     """
-    trial, sides = np.empty_like(actions), np.zeros((N_SIDES + 2, 3))
+    trial, sides = np.empty_like(actions), np.zeros((N_SIDES + 1, 3))
     look(q, scene.center, arm)
-    write_sides(arm.hand, scene.goal, sides[2:])
-    for r in range(3):
-        sides[1, r] = side[r]
-    best, chosen, clear = np.inf, 0, False
-    for i in range(N_SIDES + 2):
-        if i == 1 and _dot(side, side) == 0.0:
-            continue
+    write_sides(arm.hand, scene.goal, sides[1:])
+    best, clear = np.inf, False
+    for i in range(N_SIDES + 1):
         price, least = roll_out(q, velocity, scene, sides[i], t, arm, program, trial)
-        price -= t.stay if i == 1 else 0.0
-        if price < best:
-            best, chosen = price, i
-            for step in range(len(actions)):
-                for r in range(3):
-                    actions[step, r] = trial[step, r]
         clear = i == 0 and least > t.turn_far
+        if price < best:
+            best = price
+            for r in range(3):
+                side[r] = sides[i, r]
+                for step in range(len(actions)):
+                    actions[step, r] = trial[step, r]
         if clear:
             break
-    for r in range(3):
-        side[r] = sides[chosen, r]
     return clear
