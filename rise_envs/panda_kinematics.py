@@ -8,6 +8,9 @@ side counting four times: over poses and points of the workspace they err by 2 m
 
 Shapes: B batch, K capsules. SI units, world frame. Functions marked *in place* write into arrays that the
 caller owns, so that searches over thousands of poses allocate nothing.
+
+numba's cache watches each compiled function's own file only: after an edit here, delete the ``__pycache__``
+folders of this package and of ``rise_agents.experts``, which compiled these functions into theirs.
 """
 
 from __future__ import annotations
