@@ -2,7 +2,7 @@
 
 The arm is that of panda-gym: pybullet's ``franka_panda/panda.urdf`` with its base at ``BASE``, seven joints
 and a closed gripper. There are nine frames: 0 the base, 1 to 7 after each joint, 8 the hand. The *hand point*
-(the end effector that the environment reports) is fixed to frame 8. Nineteen capsules stand for the collision
+(the end effector that the environment reports) is fixed to frame 8. Twenty capsules stand for the collision
 shapes. They were fitted once to the engine's closest-point distances of 3 to 20 cm, with errors to the unsafe
 side counting four times: over poses and points of the workspace they err by 2 mm root mean square.
 
@@ -50,7 +50,8 @@ _HAND_POINT = 0.105  # along z of frame 8
 # Frame, one end, other end (in that frame), radius.
 _CAPSULE_TABLE = np.array(
     [
-        [0, -0.0797, -0.0007, -0.0002, -0.0071, -0.0010, 0.0776, 0.0786],
+        [0, -0.0538, 0.0000, 0.0402, -0.0418, 0.0000, -0.0055, 0.1046],
+        [0, 0.0000, 0.0001, 0.1093, 0.0118, -0.0001, -0.0129, 0.0623],
         [1, 0.0001, -0.0175, 0.0017, -0.0001, -0.0008, -0.1453, 0.0573],
         [1, 0.0001, -0.0759, 0.0001, 0.0002, 0.0005, -0.1848, 0.0560],
         [2, 0.0000, 0.0014, 0.0169, 0.0000, -0.1472, 0.0004, 0.0572],

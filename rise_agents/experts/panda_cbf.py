@@ -38,7 +38,7 @@ def check_steering(steering: Steering) -> None:
         raise ValueError(f"Steering.decay must be in (0, 1], got {steering.decay!r}")
     if not steering.turn_near < steering.turn_far:
         raise ValueError(f"Steering.turn_near must be below turn_far, got {steering!r}")
-    for name in ("slow_down", "penalty", "horizon"):
+    for name in ("slow_down", "price", "horizon"):
         if not getattr(steering, name) > 0:
             raise ValueError(f"Steering.{name} must be positive, got {getattr(steering, name)!r}")
 

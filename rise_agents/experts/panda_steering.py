@@ -43,7 +43,7 @@ class Steering(NamedTuple):
         floor: least height of the hand point over the table (m).
         reach: greatest distance of the hand point from the circle of the shoulder (m).
         slow_down: distance to the goal within which the wanted action shrinks (m).
-        penalty: price of breaking a barrier, per unit of action.
+        price: of the squared breach of a barrier, in units of squared action.
         horizon: steps of a roll-out.
     """
 
@@ -56,7 +56,7 @@ class Steering(NamedTuple):
     floor: float = 0.02
     reach: float = 0.73
     slow_down: float = 0.06
-    penalty: float = 50.0
+    price: float = 1000.0
     horizon: int = 16
 
 
@@ -65,18 +65,17 @@ class Program(NamedTuple):
 
     rows: Array  # (R, 3), unit length
     bound: Array  # (R,)
-    price: Array  # (R,)
 
 
 @njit(cache=True)
 def make_program() -> Program:
     """Arrays for the rows of all capsules, the table and the reach."""
     size = panda.N_CAPSULES + 2
-    return Program(np.empty((size, 3)), np.empty(size), np.empty(size))
+    return Program(np.empty((size, 3)), np.empty(size))
 
 
 @njit(cache=True)
-def _add_row(n: int, gradient: Array, drift: float, least: float, price: float, program: Program) -> int:
+def _add_row(n: int, gradient: Array, drift: float, least: float, program: Program) -> int:
     """Add row number ``n``, gradient · displacement + drift ≥ least, scaled to unit length in the action."""
     rows = program.rows
     square = 0.0
@@ -93,7 +92,6 @@ def _add_row(n: int, gradient: Array, drift: float, least: float, price: float, 
     for r in range(3):
         rows[n, r] /= length
     program.bound[n] = (least - drift) / length
-    program.price[n] = price
     return n + 1
 
 
@@ -114,17 +112,17 @@ def write_barriers(velocity: Array, scene: Scene, t: Steering, arm: Arm, program
         if gap < t.watch:
             write_gradient(k, scene.center, arm, normal, gradient)
             change = _dot(gradient, coast) - _dot(normal, scene.drift)
-            n = _add_row(n, gradient, change, -t.decay * (gap - t.margin), t.penalty, program)
+            n = _add_row(n, gradient, change, -t.decay * (gap - t.margin), program)
     height = arm.hand[2] - t.floor
     gradient[0], gradient[1], gradient[2] = 0.0, 0.0, 1.0
-    n = _add_row(n, gradient, coast[2], -t.decay * height, t.penalty, program)
+    n = _add_row(n, gradient, coast[2], -t.decay * height, program)
     # The shoulder's circle, for a hand held down: radius 0.088 m about the base's axis, 0.121 m high.
     x, y, z = arm.hand[0] - panda.BASE[0], arm.hand[1], arm.hand[2] - 0.121
     across = np.hypot(x, y)
     far = np.hypot(across - 0.088, z) + 1e-9
     slope = -(across - 0.088) / (far * (across + 1e-9))
     gradient[0], gradient[1], gradient[2] = slope * x, slope * y, -z / far
-    return _add_row(n, gradient, _dot(gradient, coast), -t.decay * (t.reach - far), t.penalty, program)
+    return _add_row(n, gradient, _dot(gradient, coast), -t.decay * (t.reach - far), program)
 
 
 @njit(cache=True)
@@ -172,12 +170,12 @@ def steer(
         action: receives the action, (3,), inside [−1, 1].
 
     Returns:
-        The largest violation of a barrier by the action, in units of action: 0 if the QP is feasible.
+        The largest breach of a barrier by the action, in units of action; about 0 if all can be kept.
     """
     wanted = np.empty(3)
     write_wanted(scene, side, t, arm, wanted)
     n = write_barriers(velocity, scene, t, arm, program)
-    return solve_qp(wanted, program.rows, program.bound, program.price, n, action)
+    return solve_qp(wanted, program.rows, program.bound, n, t.price, action)
 
 
 @njit(cache=True)
