@@ -18,6 +18,10 @@ from rise_agents.agent import Progress as Tell
 _PLAIN_EVERY = 30.0  # s between two lines of the same job where there is no terminal
 
 
+def _plain(value: float) -> str:
+    return f"{value:,.0f}" if abs(value) >= 1_000 else f"{value:.3g}"
+
+
 class Display:
     """Shows the steps of a run. A context manager; safe to call from several threads."""
 
@@ -89,7 +93,7 @@ class Display:
         self._end(job.name, words)
 
     def _show(self, name: str, share: float, figures: dict[str, float]) -> None:
-        words = "  ".join(f"{key} {value:.3g}" for key, value in list(figures.items())[:4])
+        words = "  ".join(f"{key} {_plain(value)}" for key, value in list(figures.items())[:4])
         with self._lock:
             if self.live:
                 if name not in self._tasks:
@@ -111,4 +115,4 @@ class Display:
 
     def _line(self, text: str) -> None:
         seconds = time.monotonic() - self._started
-        self.console.print(f"{seconds:6.0f} s  {text}", highlight=False, markup=False)
+        self.console.print(f"{seconds:6.0f} s  {text}", highlight=False, markup=False, soft_wrap=True)
