@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from types import TracebackType
@@ -43,6 +44,7 @@ class Display:
         self._told: dict[str, float] = {}
         self._total: TaskID | None = None
         self._jobs, self._finished, self._started = 0, set[str](), time.monotonic()
+        self._left = Counter[str]()
 
     def __enter__(self) -> Display:
         self.bars.start()
@@ -73,6 +75,7 @@ class Display:
         """Say how many jobs there will be."""
         self._jobs = len(jobs)
         there = sum(job.output.exists() for job in jobs)
+        self._left = Counter(job.name for job in jobs)
         self._line(f"{len(jobs)} jobs: train, evaluate, draw" + (f"; {there} done already" if there else ""))
         if self.live:
             self._total = self.bars.add_task("[bold]all jobs", total=len(jobs), figures="")
@@ -86,10 +89,12 @@ class Display:
             return
         with self._lock:
             self._finished.add(key)
+            self._left[job.name] -= 1
+            last = not self._left[job.name]  # of the portions that a large job was cut into
         if self._total is not None:
             self.bars.update(self._total, completed=len(self._finished))
         heard = job.name in self._tasks or job.name in self._told
-        words = f"[{len(self._finished)}/{self._jobs}] {job.name}" if heard else ""
+        words = f"[{len(self._finished)}/{self._jobs}] {job.name}" if heard and last else ""
         self._end(job.name, words)
 
     def _show(self, name: str, share: float, figures: dict[str, float]) -> None:
