@@ -166,7 +166,7 @@ class CPPO:
     # validation scenarios, the Panda's on a kinematic model of the arm (in the engine it learns more slowly).
     PRESETS: ClassVar[dict[str, dict[str, Any]]] = {
         "RISE-GroundVehicle-v0": {
-            **{"n_envs": 128, "n_steps": 64, "batch_size": 1024, "total_steps": 1_000_000},
+            **{"n_envs": 128, "n_steps": 64, "batch_size": 1024, "total_steps": 1_500_000},
             **{"learning_rate": 1e-3, "final_learning_rate": 5e-5},
         },
         "RISE-SafePanda-v0": {
