@@ -21,7 +21,7 @@ from rise_envs.noise_wrappers import ObservationNoise
 Frame = NDArray[np.uint8]
 FRAMES_PER_SECOND = 10
 HOLD = 12  # frames that the last picture of an episode stays
-KEY_FRAMES = 5
+KEY_FRAMES = 4
 _BAR = 40  # px, height of the caption
 _COLOURS = {"reached": "#1a7f37", "collision": "#c1121f", "not reached": "#9a6700"}
 
@@ -85,7 +85,7 @@ def strip(clip: Clip, count: int = KEY_FRAMES) -> Frame:
         last = n == count - 1
         words = clip.outcome if last else ""
         cell = Image.fromarray(
-            caption(clip.frames[pick], f"t = {clip.times[pick]:.1f} s", words, _COLOURS[clip.outcome])
+            caption(clip.frames[pick], f"t = {clip.times[pick]:.2f} s", words, _COLOURS[clip.outcome])
         )
         cells.append(np.asarray(cell.resize((cell.width // 2, cell.height // 2), Image.Resampling.LANCZOS)))
     return np.concatenate(cells, axis=1)
@@ -112,7 +112,7 @@ def record(
     for n, clip in enumerate(clips):
         for i, frame in enumerate(clip.frames):
             ended = i == len(clip.frames) - 1
-            words = clip.outcome if ended else f"scenario {n} · {clip.times[i]:.1f} s"
+            words = clip.outcome if ended else f"scenario {n} · {clip.times[i]:.2f} s"
             captioned = caption(frame, title, words, _COLOURS[clip.outcome] if ended else "#57606a")
             frames += [captioned] * (HOLD if ended else 1)
     output.parent.mkdir(parents=True, exist_ok=True)
