@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from benchmarks.jobs import Job
-from rise_agents.workers import limit_threads
+from rise_agents.workers import limit_threads, stop
 
 # Told the job, the share that is done in [0, 1] and its figures of the moment.
 Watcher = Callable[[Job, float, dict[str, float]], None]
@@ -69,7 +69,7 @@ def run_jobs(jobs: Sequence[Job], workers: int, watch: Watcher) -> list[Failure]
             try:
                 return _schedule(pool, pending, workers, watch)
             except BaseException:
-                _stop(pool)
+                stop(pool)
                 raise
     finally:
         messages.put(None)
@@ -114,10 +114,3 @@ def _relay(messages: Any, pending: list[Job], watch: Watcher) -> None:
         number, share, figures = message
         if share < 1:  # the end of a job is told by its future
             watch(pending[number], share, figures)
-
-
-def _stop(pool: ProcessPoolExecutor) -> None:
-    """End the workers at once: their unfinished outputs are temporary files, nothing is lost."""
-    for process in list(getattr(pool, "_processes", {}).values()):
-        process.terminate()
-    pool.shutdown(wait=False, cancel_futures=True)

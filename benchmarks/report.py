@@ -84,10 +84,9 @@ def summary_markdown(summary: Sequence[SummaryRow], run: Mapping[str, Any]) -> s
     for env in envs:
         rows = _rows_of(summary, env)
         blocks += [f"### {_title(rows)}", _markdown_table(rows)]
-    blocks.append("## How the agents were trained")
-    blocks.append(
-        "\n".join(line for name, facts in run["agents"].items() for line in _fact(agent_label(name), facts))
-    )
+    lines = [line for name, facts in run["agents"].items() for line in _fact(agent_label(name), facts)]
+    if lines:
+        blocks += ["## How the agents were trained", "\n".join(lines)]
     blocks += ["## How to repeat", f"```sh\n{run['command']}\n```"]
     return "\n\n".join(blocks) + "\n"
 

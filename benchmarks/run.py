@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.protocol import PRESETS, Plan, make_plan
-from rise_agents.cli import Parser
+from rise_agents.cli import Parser, prepare_folder
 
 _EXAMPLES = """\
 examples:
@@ -146,17 +146,6 @@ def _check_device(device: str) -> None:
         raise ValueError(f"--device {device} cannot be used here: {reason}") from None
 
 
-def prepare_folder(out: Path) -> None:
-    """Make the run folder; raises ``ValueError`` if nothing can be written there."""
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        probe = out / ".writable"
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise ValueError(f"cannot write to the run folder {out}: {error.strerror}") from None
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the benchmark; returns the exit code: 0 done, 1 something failed, 2 bad arguments, 130 interrupted."""
     started = time.perf_counter()
@@ -169,6 +158,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except ValueError as error:
         print(f"benchmarks.run: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        return 130
     from benchmarks.pipeline import execute
     from rise_agents.workers import available_cores
 

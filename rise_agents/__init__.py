@@ -68,4 +68,9 @@ def load_agent(path: str | os.PathLike[str], env_id: str | None = None, device: 
         raise checkpoint.CheckpointError(
             path, f"was trained on {env!r}, not {env_id!r}", "train on that environment"
         )
-    return agent_class(name).from_checkpoint(arrays, description, device)
+    try:
+        return agent_class(name).from_checkpoint(arrays, description, device)
+    except (KeyError, TypeError, ValueError) as error:
+        raise checkpoint.CheckpointError(
+            path, f"lacks a part of the agent ({error})", "train it again"
+        ) from None

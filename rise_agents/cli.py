@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 from typing import Any, NoReturn
 
 from rise_agents.agent import nearest
@@ -29,3 +30,14 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Raise ``ValueError``."""
         raise ValueError(message)
+
+
+def prepare_folder(out: Path) -> None:
+    """Make a folder; raises ``ValueError`` if nothing can be written there."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        probe = out / ".writable"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise ValueError(f"cannot write to the folder {out}: {error.strerror}") from None

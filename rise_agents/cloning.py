@@ -170,7 +170,9 @@ def check_source(source: Any, env_id: str, name: str, transitions: int) -> Demon
 
 
 def save(path: str | os.PathLike[str], agent: Any, arrays: dict[str, NDArray]) -> None:
-    """Store a cloned agent."""
+    """Store a cloned agent; raises ``RuntimeError`` if it has learned nothing yet."""
+    if not arrays:
+        raise untrained(agent.name)
     description = {
         "agent": agent.name,
         "env": agent.env_id,

@@ -297,6 +297,7 @@ class CPPO:
 
         Raises:
             RuntimeError: the agent has learned nothing yet.
+            ValueError: a number that is not finite.
         """
         if self._actor is None:
             raise RuntimeError("this C-PPO agent is untrained: call learn() or load a checkpoint first")
@@ -304,6 +305,7 @@ class CPPO:
         single = all(np.ndim(parts[key]) == rank for key, rank in self._notes["ranks"].items())
         if single:
             parts = {key: np.asarray(part)[None] for key, part in parts.items()}
+        readings.check_finite(parts)
         output = self._actor.output(self._inputs(parts))
         if not deterministic:
             keys, counter = draw_state(state, episode_start, len(output), self._rng)
@@ -317,6 +319,7 @@ class CPPO:
 
         Raises:
             RuntimeError: the agent has learned nothing yet.
+            ValueError: a number that is not finite.
         """
         if self._actor is None:
             raise RuntimeError("this C-PPO agent is untrained: call learn() before save()")

@@ -34,8 +34,22 @@ def is_batched(observation: dict[str, Any]) -> bool:
 
 
 def as_batch(observation: dict[str, Any]) -> dict[str, Array]:
-    """The observation with a leading batch dimension, as float64."""
-    return {key: np.atleast_2d(np.asarray(value, np.float64)) for key, value in observation.items()}
+    """The observation with a leading batch dimension, as float64.
+
+    Raises:
+        ValueError: a number that is not finite, with its key and place.
+    """
+    batch = {key: np.atleast_2d(np.asarray(value, np.float64)) for key, value in observation.items()}
+    check_finite(batch)
+    return batch
+
+
+def check_finite(parts: dict[str, NDArray]) -> None:
+    """Raise ``ValueError`` that names the key and the place of a number that is not finite."""
+    for key, value in parts.items():
+        if not np.isfinite(value).all():
+            where = np.argwhere(~np.isfinite(value))[0].tolist()
+            raise ValueError(f"observation[{key!r}] is not finite at {where}")
 
 
 def inputs(task: Task, frame: str, observation: dict[str, Array]) -> tuple[Array, Array]:

@@ -27,3 +27,10 @@ def make_pool(workers: int) -> ProcessPoolExecutor:
     """A pool of freshly started processes (a fork would copy the parent's threads and engines)."""
     limit_threads()
     return ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
+
+
+def stop(pool: ProcessPoolExecutor) -> None:
+    """End the workers at once: their unfinished outputs are temporary files, nothing is lost."""
+    for process in list((getattr(pool, "_processes", None) or {}).values()):
+        process.terminate()
+    pool.shutdown(wait=False, cancel_futures=True)

@@ -119,6 +119,20 @@ def test_acting_before_learning_is_a_clear_error(name, vehicle_demonstrations):
         make_agent(name, VEHICLE).predict(observations(vehicle_demonstrations))
 
 
+def test_cloned_agents_do_not_store_what_has_not_learned(tmp_path):
+    for name in ("rise", "pcbc"):
+        with pytest.raises(RuntimeError, match="learn"):
+            make_agent(name, VEHICLE).save(tmp_path / "agent.rise")
+
+
+@pytest.mark.parametrize("name", AGENTS)
+def test_observations_that_are_not_finite_are_refused(agents, vehicle_demonstrations, name):
+    batch = observations(vehicle_demonstrations)
+    batch["obstacle"][5, 2] = np.nan
+    with pytest.raises(ValueError, match=r"obstacle.*not finite at \[5, 2\]"):
+        agents[name].predict(batch)
+
+
 def test_cloned_agents_refuse_other_sources(vehicle_demonstrations):
     for name in AGENTS:
         if agent_class(name).learns_from != "demonstrations":

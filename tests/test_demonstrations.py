@@ -151,3 +151,7 @@ def test_command_line(tmp_path, capsys):
     assert "holds a demonstration set already" in capsys.readouterr().err
     assert main(["--env", "RISE-GroundVehicl-v0", "--out", str(out)]) == 2
     assert "did you mean 'RISE-GroundVehicle-v0'" in capsys.readouterr().err
+    assert main(["--env", VEHICLE, "--seed", "-1", "--out", str(tmp_path / "b")]) == 2
+    assert "seed must be in" in capsys.readouterr().err
+    assert main(["--env", VEHICLE, "--minari", "no good id", "--out", str(tmp_path / "b")]) == 2
+    assert not (tmp_path / "b").exists()

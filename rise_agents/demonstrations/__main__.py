@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,8 +12,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from rise_agents import demonstrations
 from rise_agents.agent import nearest
-from rise_agents.cli import Parser
+from rise_agents.cli import Parser, prepare_folder
+from rise_agents.demonstrations.minari_io import check_id, export
 from rise_agents.experts import expert_names
+from rise_agents.seeds import episode_seeds
 from rise_agents.workers import available_cores
 from rise_envs import ENVS
 
@@ -36,29 +39,40 @@ def parser() -> Parser:
     p.add_argument("--env", required=True, metavar="ID", help=f"environment: {', '.join(ENVS)}")
     p.add_argument("--expert", default="mixture", metavar="NAME", help="who demonstrates (default: mixture)")
     p.add_argument("--episodes", type=int, default=1000, metavar="N", help="episodes to keep (default: 1000)")
-    p.add_argument("--seed", type=int, default=0, metavar="N", help="range of training seeds (default: 0)")
+    p.add_argument(
+        "--seed", type=int, default=0, metavar="N", help="range of training seeds, 0 to 999 (default: 0)"
+    )
     p.add_argument("--workers", type=int, default=None, metavar="N", help="processes (default: one per core)")
     p.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write")
     p.add_argument("--minari", metavar="ID", help="also export to the local Minari store under this id")
     return p
 
 
+def checked(argv: Sequence[str] | None) -> argparse.Namespace:
+    """The arguments; raises ``ValueError`` for whatever can be known to fail before hours of recording."""
+    a = parser().parse_args(argv)
+    if a.env not in ENVS:
+        raise ValueError(f"unknown environment {a.env!r}: {nearest(a.env, ENVS)}")
+    if a.expert not in expert_names(a.env):
+        raise ValueError(f"unknown expert {a.expert!r}: {nearest(a.expert, expert_names(a.env))}")
+    for name in ("episodes", "workers"):
+        if getattr(a, name) is not None and getattr(a, name) < 1:
+            raise ValueError(f"--{name} must be at least 1, got {getattr(a, name)}")
+    episode_seeds("train", a.seed, 0, a.episodes)  # raises where the seeds do not suffice
+    if (a.out / demonstrations.CARD).exists():
+        raise ValueError(f"{a.out} holds a demonstration set already: name another folder or remove it")
+    if a.minari:
+        check_id(a.minari)
+    prepare_folder(a.out)
+    return a
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Record demonstrations; returns the exit code: 0 done, 1 failed, 2 bad arguments, 130 interrupted."""
     console = Console(stderr=True)
     try:
-        a = parser().parse_args(argv)
-        if a.env not in ENVS:
-            raise ValueError(f"unknown environment {a.env!r}: {nearest(a.env, ENVS)}")
-        if a.expert not in expert_names(a.env):
-            raise ValueError(f"unknown expert {a.expert!r}: {nearest(a.expert, expert_names(a.env))}")
-        for name in ("episodes", "workers"):
-            if getattr(a, name) is not None and getattr(a, name) < 1:
-                raise ValueError(f"--{name} must be at least 1, got {getattr(a, name)}")
-        if (a.out / demonstrations.CARD).exists():
-            raise ValueError(f"{a.out} holds a demonstration set already: name another folder or remove it")
-        a.out.mkdir(parents=True, exist_ok=True)
-    except (ValueError, OSError) as error:
+        a = checked(argv)
+    except ValueError as error:
         print(f"rise_agents.demonstrations: {error}", file=sys.stderr)
         return 2
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
@@ -75,8 +89,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             )
         made.save(a.out)
         if a.minari:
-            from rise_agents.demonstrations.minari_io import export
-
             export(made, a.minari)
     except KeyboardInterrupt:
         print("\nrise_agents.demonstrations: interrupted, nothing was written", file=sys.stderr)

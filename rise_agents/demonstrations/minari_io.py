@@ -20,6 +20,16 @@ from rise_envs.task import env_class
 _SEED, _EXPERT = "rise_seed", "rise_expert"
 
 
+def check_id(dataset_id: str) -> None:
+    """Raise ``ValueError`` if a dataset of this id cannot be created: malformed, or there already."""
+    from minari import list_local_datasets
+    from minari.dataset.minari_dataset import parse_dataset_id
+
+    parse_dataset_id(dataset_id)
+    if dataset_id in list_local_datasets():
+        raise ValueError(f"the local Minari store holds {dataset_id!r} already: choose another version")
+
+
 def export(d: Demonstrations, dataset_id: str) -> None:
     """Store demonstrations as the Minari dataset ``dataset_id`` (``namespace/name-v0``).
 

@@ -15,7 +15,7 @@ from rise_agents.demonstrations.dataset import OBSERVATIONS, Demonstrations
 from rise_agents.experts import make_expert
 from rise_agents.rollout import Transitions, policy_keys, rollout
 from rise_agents.seeds import PER_RUN, episode_seeds
-from rise_agents.workers import make_pool
+from rise_agents.workers import make_pool, stop
 from rise_envs.task import env_class
 
 CHUNK = 50  # candidate episodes per job, at most
@@ -89,8 +89,8 @@ def _ordered(env_id: str, expert: str, episodes: int, seed: int, workers: int) -
                     queue.append(pool.submit(_candidates, env_id, expert, seed, number * chunk, chunk))
                 yield queue[number].result()
                 queue[number] = None  # frees the arrays
-        finally:
-            pool.shutdown(cancel_futures=True)
+        finally:  # enough episodes, or interrupted: what is still running is not needed
+            stop(pool)
 
 
 def _params(env_id: str) -> dict[str, Any]:
