@@ -29,9 +29,9 @@ NEUTRAL = np.array([0.0, 0.41, 0.0, -1.85, 0.0, 2.26, 0.79])  # panda-gym's star
 JOINT_LOW = np.array([-2.9671, -1.8326, -2.9671, -3.1416, -2.9671, -0.0873, -2.9671])
 JOINT_HIGH = np.array([2.9671, 1.8326, 2.9671, 0.0, 2.9671, 3.8223, 2.9671])
 
-# Joint i turns about the z axis of frame i + 1, which sits at _ORIGIN[i] in frame i, turned about x by
-# _TWIST[i] quarter turns.
-_ORIGIN = np.array(
+# Joint i turns about the z axis of frame i + 1, which sits at ORIGIN[i] in frame i, turned about x by
+# TWIST[i] quarter turns.
+ORIGIN = np.array(
     [
         [0.0, 0.0, 0.333],
         [0.0, 0.0, 0.0],
@@ -42,7 +42,7 @@ _ORIGIN = np.array(
         [0.088, 0.0, 0.0],
     ]
 )
-_TWIST = np.array([0.0, -1.0, 1.0, 1.0, -1.0, 1.0, 1.0])
+TWIST = np.array([0.0, -1.0, 1.0, 1.0, -1.0, 1.0, 1.0])
 _FLANGE = 0.107  # frame 7 to frame 8 along z; frame 8 is turned by −45° about z
 _HALF = np.sqrt(0.5)
 _HAND_POINT = 0.105  # along z of frame 8
@@ -94,10 +94,10 @@ def write_frames(q: Array, rotation: Array, position: Array) -> None:
         for c in range(3):
             rotation[0, r, c] = 1.0 if r == c else 0.0
     for i in range(N_JOINTS):
-        cos, sin, twist = np.cos(q[i]), np.sin(q[i]), _TWIST[i]
+        cos, sin, twist = np.cos(q[i]), np.sin(q[i]), TWIST[i]
         for r in range(3):
             x, y, z = rotation[i, r, 0], rotation[i, r, 1], rotation[i, r, 2]
-            position[i + 1, r] = position[i, r] + x * _ORIGIN[i, 0] + y * _ORIGIN[i, 1] + z * _ORIGIN[i, 2]
+            position[i + 1, r] = position[i, r] + x * ORIGIN[i, 0] + y * ORIGIN[i, 1] + z * ORIGIN[i, 2]
             # A quarter turn about x only swaps the other two axes.
             if twist != 0.0:
                 y, z = twist * z, -twist * y
