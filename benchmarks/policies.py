@@ -12,7 +12,7 @@ from rise_agents import load_agent
 from rise_agents.agent import State, draw_state, fresh_state
 from rise_agents.cloning import ActionUnits
 from rise_agents.experts import make_expert
-from rise_agents.readings import as_batch, is_batched
+from rise_agents.readings import as_batch
 from rise_envs import streams
 
 
@@ -32,12 +32,13 @@ class Random:
         self, observation: Any, state: State = None, episode_start: Any = None, deterministic: bool = False
     ) -> tuple[NDArray[np.float32], State]:
         """Actions (B, A), or (A,) for one observation."""
-        rows = len(as_batch(observation)["desired_goal"])
+        batch, single = as_batch(observation)
+        rows = len(batch["desired_goal"])
         keys, counter = draw_state(state, episode_start, rows, np.random.default_rng(0))
         size = len(self.units.low)
         draws = counter[:, None] * np.uint64(size) + np.arange(size, dtype=np.uint64)
         action = self.units.to_action(2 * streams.uniform(keys[:, None], draws) - 1)
-        return (action if is_batched(observation) else action[0]), (keys, counter + np.uint64(1))
+        return (action[0] if single else action), (keys, counter + np.uint64(1))
 
 
 def make_policy(env_id: str, row: str, checkpoint: Path | None) -> Any:

@@ -11,13 +11,13 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from rise_agents import cloning
 from rise_agents.agent import Progress, State, make_config, silent
-from rise_agents.cloning import ActionUnits, CloningConfig, CloningData, Eyes
+from rise_agents.cloning import ActionUnits, CloningConfig, Eyes
 from rise_agents.networks import mlp
-from rise_agents.readings import as_batch, is_batched
+from rise_agents.readings import as_batch, check_finite
 from rise_agents.training import Forward, fit, to_arrays
 
 Config = CloningConfig
@@ -48,16 +48,14 @@ class PCBC:
     def learn(self, source: Any, progress: Progress = silent) -> PCBC:
         """Clone :class:`rise_agents.demonstrations.Demonstrations`."""
         c = self.config
-        demonstrations = cloning.check_source(source, self.env_id, self.name, c.transitions)
-        generator = cloning.seeded(self.seed, self.device)
-        eyes = Eyes.fit(self.task, c.frame, demonstrations)
-        data = cloning.prepare(demonstrations, eyes, self.units, self.device)
-        width = data.robot.shape[1] + data.reading.shape[1]
-        policy = mlp(width, c.hidden, cloning.output_size(data.action.shape[1], c.loss)).to(self.device)
+        _, eyes, data, generator = cloning.begin(self, source)
+        seen = torch.cat((data.robot, data.reading), -1)
+        policy = mlp(seen.shape[1], c.hidden, cloning.output_size(data.action.shape[1], c.loss))
+        policy.to(self.device)
         fit(
             policy.parameters(),
-            lambda rows: policy_loss(policy, data, rows, c.loss),
-            len(data.action),
+            lambda seen, action: policy_loss(policy, seen, action, c.loss),
+            (seen, data.action),
             updates=c.updates,
             batch_size=c.batch_size,
             learning_rate=c.learning_rate,
@@ -82,10 +80,11 @@ class PCBC:
         """Actions (B, A) for a batch of observations, or (A,) for one; nothing is drawn."""
         if not self._arrays:
             raise cloning.untrained(self.name)
-        robot, reading = self._eyes(as_batch(observation))
-        output = self._policy(np.concatenate((robot, reading), -1))
+        rows, single = as_batch(observation)
+        check_finite(rows)
+        output = self._policy(self._eyes.see(rows))
         action = self.units.to_action(output[:, : len(self.units.low)])
-        return (action if is_batched(observation) else action[0]), None
+        return (action[0] if single else action), None
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Store the agent; :func:`rise_agents.load_agent` reads it."""
@@ -97,7 +96,6 @@ class PCBC:
         return cls(description["env"], description["config"], description["seed"], device)._use(arrays)
 
 
-def policy_loss(policy: Any, data: CloningData, rows: Tensor, kind: str) -> dict[str, Tensor]:
-    """The imitation loss of the transitions ``rows``."""
-    output = policy(torch.cat((data.robot[rows], data.reading[rows]), -1))
-    return {"loss": cloning.imitation_loss(output, data.action[rows], kind)}
+def policy_loss(policy: nn.Module, seen: Tensor, action: Tensor, kind: str) -> dict[str, Tensor]:
+    """The imitation loss of actions (B, A) at robot and reading inputs (B, R + C)."""
+    return {"loss": cloning.imitation_loss(policy(seen), action, kind)}

@@ -15,6 +15,8 @@ Shapes: B batch, R robot inputs, C reading inputs, N obstacles, D dimensions.
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,37 +30,32 @@ Array = NDArray[np.float64]
 FRAMES = ("world", "body", "features")
 
 
-def is_batched(observation: dict[str, Any]) -> bool:
-    """Whether the observation holds a batch (B, …) rather than a single one."""
-    return np.ndim(observation["desired_goal"]) == 2
+def as_batch(observation: Mapping[str, Any]) -> tuple[dict[str, Array], bool]:
+    """The observation as float64 with a batch axis in front, and whether it came as a single one.
 
-
-def as_batch(observation: dict[str, Any]) -> dict[str, Array]:
-    """The observation with a leading batch dimension, as float64.
-
-    Raises:
-        ValueError: a number that is not finite, with its key and place.
+    An observation is a batch if its ``desired_goal`` has two dimensions.
     """
-    batch = {key: np.atleast_2d(np.asarray(value, np.float64)) for key, value in observation.items()}
-    check_finite(batch)
-    return batch
+    rows = {name: np.asarray(value, np.float64) for name, value in observation.items()}
+    single = rows["desired_goal"].ndim == 1
+    return ({name: value[None] for name, value in rows.items()} if single else rows), single
 
 
-def check_finite(parts: dict[str, NDArray]) -> None:
+def check_finite(parts: Mapping[str, NDArray]) -> None:
     """Raise ``ValueError`` that names the key and the place of a number that is not finite."""
     for key, value in parts.items():
-        if not np.isfinite(value).all():
+        # A sum of squares is finite only if every number is, and takes a third of the time to find out.
+        if not np.vdot(value, value) < np.inf and not np.isfinite(value).all():
             where = np.argwhere(~np.isfinite(value))[0].tolist()
             raise ValueError(f"observation[{key!r}] is not finite at {where}")
 
 
 def inputs(task: Task, frame: str, observation: dict[str, Array]) -> tuple[Array, Array]:
     """Robot inputs (B, R) and reading inputs (B, C) of a batched observation in the given frame."""
-    state, goal, reading = (observation[key] for key in ("observation", "desired_goal", "obstacle"))
+    state, goal, reading = observation["observation"], observation["desired_goal"], observation["obstacle"]
     if frame == "world":
         return np.concatenate((state, goal), -1), reading
     goal, position, velocity, radius = to_body(task, state, goal, reading)
-    robot = np.concatenate((state[:, list(task.body_state)], goal), -1)
+    robot = np.concatenate((state[:, _columns(task.body_state)], goal), -1) if task.body_state else goal
     if frame == "body":
         c = np.concatenate((position, velocity, radius[..., None]), -1)
         return robot, c.reshape(len(c), -1)
@@ -75,9 +72,18 @@ def to_body(task: Task, state: Array, goal: Array, reading: Array) -> tuple[Arra
     """
     origin, rotation = task.pose(state)
     position, velocity, radius = task.split(reading)
-    # Rows times R is Rᵀ times columns: world to body.
-    goal = ((goal - origin)[:, None] @ rotation)[:, 0]
-    return goal, (position - origin[:, None]) @ rotation, velocity @ rotation, radius
+    n = task.n_obstacles
+    vectors = np.concatenate((goal[:, None], position, velocity), 1)
+    vectors[:, : 1 + n] -= origin[:, None]
+    turned = vectors @ rotation  # rows times R is Rᵀ times columns: world to body
+    return turned[:, 0], turned[:, 1 : 1 + n], turned[:, 1 + n :], radius
+
+
+@functools.cache
+def _columns(numbers: tuple[int, ...]) -> slice | list[int]:
+    """The given columns of an array, as a view of it where they lie side by side."""
+    side_by_side = numbers == tuple(range(numbers[0], numbers[-1] + 1))
+    return slice(numbers[0], numbers[-1] + 1) if side_by_side else list(numbers)
 
 
 def to_world(task: Task, state: Array, position: Array, velocity: Array, radius: Array) -> Array:

@@ -148,10 +148,7 @@ class Rise:
     def learn(self, source: Any, progress: Progress = silent) -> Rise:
         """Algorithm 1 on :class:`rise_agents.demonstrations.Demonstrations`."""
         c = self.config
-        demonstrations = cloning.check_source(source, self.env_id, self.name, c.transitions)
-        generator = cloning.seeded(self.seed, self.device)
-        eyes = Eyes.fit(self.task, c.frame, demonstrations)
-        data = cloning.prepare(demonstrations, eyes, self.units, self.device)
+        demonstrations, eyes, data, generator = cloning.begin(self, source)
         # Standard units → units of the reading noise: what the decoder answers in.
         sample = demonstrations.subsample(20_000)
         noise = readings.reading_units(self.task, c.frame, sample)
@@ -185,15 +182,14 @@ class Rise:
     ) -> None:
         c = self.config
 
-        def loss(rows: Tensor) -> dict[str, Tensor]:
-            reading = data.reading[rows]
-            epsilon = torch.randn((len(rows), c.latent), generator=generator, device=generator.device)
-            return vae.loss(reading, reading * ratio, epsilon, c.beta)
+        def loss(reading: Tensor, target: Tensor) -> dict[str, Tensor]:
+            epsilon = torch.randn((len(reading), c.latent), generator=generator, device=generator.device)
+            return vae.loss(reading, target, epsilon, c.beta)
 
         fit(
             vae.parameters(),
             loss,
-            len(data.reading),
+            (data.reading, data.reading * ratio),
             updates=c.vae_updates,
             batch_size=c.vae_batch_size,
             learning_rate=c.learning_rate,
@@ -209,19 +205,17 @@ class Rise:
         generator: torch.Generator,
         progress: Progress,
     ) -> None:
-        c, (mu, log_sigma) = self.config, posterior
+        c = self.config
 
-        def loss(rows: Tensor) -> dict[str, Tensor]:
-            shape = (c.n_samples, len(rows), c.latent)
+        def loss(robot: Tensor, mu: Tensor, log_sigma: Tensor, action: Tensor) -> dict[str, Tensor]:
+            shape = (c.n_samples, len(mu), c.latent)
             epsilon = torch.randn(shape, generator=generator, device=generator.device)
-            return policy_loss(
-                policy, data.robot[rows], mu[rows], log_sigma[rows], data.action[rows], epsilon, c.loss
-            )
+            return policy_loss(policy, robot, mu, log_sigma, action, epsilon, c.loss)
 
         fit(
             policy.parameters(),
             loss,
-            len(data.action),
+            (data.robot, *posterior, data.action),
             updates=c.updates,
             batch_size=c.batch_size,
             learning_rate=c.learning_rate,
@@ -232,20 +226,24 @@ class Rise:
     def _use(self, arrays: dict[str, NDArray]) -> Rise:
         self._arrays = arrays
         self._eyes = Eyes.from_arrays(self.task, self.config.frame, arrays)
-        self._trunk = Forward(arrays, "vae.encoder.trunk")
-        self._heads = [
-            (arrays[f"vae.encoder.{h}.weight"].T, arrays[f"vae.encoder.{h}.bias"])
-            for h in ("mu", "log_sigma")
-        ]
-        self._policy = Forward(arrays, "policy")
+        self._trunk, self._policy = Forward(arrays, "vae.encoder.trunk"), Forward(arrays, "policy")
+        # Both heads side by side, in the policy's units: μ / spread and log σ − log spread.
+        shift, heads = np.log(arrays["vae.spread"]), ("vae.encoder.mu", "vae.encoder.log_sigma")
+        mu_scale = np.concatenate((1 / arrays["vae.spread"], np.ones_like(shift)))
+        self._head = np.concatenate([arrays[f"{head}.weight"].T for head in heads], 1) * mu_scale
+        self._head_bias = np.concatenate([arrays[f"{head}.bias"] for head in heads]) * mu_scale
+        self._head_bias[len(shift) :] -= shift
+        self._log_sigma_range = tuple(bound - shift for bound in LOG_SIGMA_RANGE)
         return self
 
     def encode(self, reading: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """The posterior of readings in standard units (B, C): μ and σ, each (B, Z), in the policy's units."""
-        features = np.maximum(self._trunk(reading), 0.0)
-        mu, log_sigma = (features @ weight + bias for weight, bias in self._heads)
-        spread = self._arrays["vae.spread"]
-        return mu / spread, np.exp(np.clip(log_sigma, *LOG_SIGMA_RANGE)) / spread
+        features = self._trunk(reading)
+        np.maximum(features, 0.0, out=features)
+        heads = np.dot(features, self._head)
+        heads += self._head_bias
+        low, high = self._log_sigma_range
+        return heads[:, : len(low)], np.exp(np.minimum(np.maximum(heads[:, len(low) :], low), high))
 
     def initial_state(self, keys: NDArray[np.uint64]) -> State:
         """Streams of posterior samples for episodes with the given keys (B,)."""
@@ -268,25 +266,30 @@ class Rise:
         """
         if not self._arrays:
             raise cloning.untrained(self.name)
-        robot, reading = self._eyes(readings.as_batch(observation))
+        rows, single = readings.as_batch(observation)
+        readings.check_finite(rows)
+        robot, reading = self._eyes(rows)
         mu, sigma = self.encode(reading)
         if deterministic:
             unit = self._act(robot, mu)
         else:
             keys, counter = draw_state(state, episode_start, len(mu), self._rng)
-            draws = counter[:, None] * np.uint64(self.config.average * mu.shape[1])
-            unit = np.zeros((len(mu), len(self.units.low)), np.float32)
-            for k in range(self.config.average):
-                epsilon = streams.normal(keys[:, None], draws + np.arange(mu.shape[1]) + k * mu.shape[1])
-                unit += self._act(robot, (mu + sigma * epsilon).astype(np.float32)) / self.config.average
+            size, average = mu.shape[1], self.config.average
+            draws = counter[:, None] * np.uint64(average * size) + np.arange(average * size, dtype=np.uint64)
+            epsilon = streams.normal(keys[:, None], draws).astype(np.float32)
+            unit = self._act(robot, mu + sigma * epsilon[:, :size])
+            for k in range(1, average):
+                unit += self._act(robot, mu + sigma * epsilon[:, k * size : (k + 1) * size])
+            if average > 1:
+                unit /= average
             state = (keys, counter + np.uint64(1))
         action = self.units.to_action(unit)
-        return (action if readings.is_batched(observation) else action[0]), state
+        return (action[0] if single else action), state
 
     def _act(self, robot: NDArray[np.float32], z: NDArray[np.float32]) -> NDArray[np.float32]:
         """Clipped unit actions of π(s, g, z)."""
         output = self._policy(np.concatenate((robot, z), -1))
-        return np.clip(output[:, : len(self.units.low)], -1.0, 1.0)
+        return cloning.clipped(output[:, : len(self.units.low)])
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Store the agent; :func:`rise_agents.load_agent` reads it."""

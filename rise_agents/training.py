@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-Loss = Callable[[Tensor], dict[str, Tensor]]
+# Maps a batch, (B, …) each, to named terms, of which ``loss`` is minimised.
+Loss = Callable[..., dict[str, Tensor]]
 
 
 def fit(
     parameters: Iterable[nn.Parameter],
     loss: Loss,
-    n: int,
+    data: Sequence[Tensor],
     *,
     updates: int,
     batch_size: int,
@@ -24,30 +25,31 @@ def fit(
     generator: torch.Generator,
     progress: Callable[[float, dict[str, float]], None],
 ) -> None:
-    """Adam with a cosine schedule to zero over shuffled passes through ``n`` rows.
+    """Adam with a cosine schedule to zero over shuffled passes through the data.
 
     Args:
         parameters: what is trained.
-        loss: maps row numbers (B,) to named terms, of which ``loss`` is minimised.
-        n: number of rows of data.
+        loss: called as ``loss(*rows)`` with a batch of each of ``data``.
+        data: tensors (T, …) of the same length, on the device of ``generator``.
         updates: gradient steps.
-        batch_size: B (at most ``n``).
+        batch_size: B (at most T).
         learning_rate: at the start.
-        generator: draws the order of the rows (its device is that of the data).
+        generator: draws the order of the rows.
         progress: told the share done and the terms, about a hundred times.
     """
-    device = generator.device
     optimiser = torch.optim.Adam(parameters, lr=learning_rate, fused=True)
-    batch_size = min(batch_size, n)
-    per_pass = n // batch_size
+    total = len(data[0])
+    batch_size = min(batch_size, total)
+    per_pass = total // batch_size
     every = max(1, updates // 100)
     for update in range(updates):
-        if update % per_pass == 0:
-            order = torch.randperm(n, generator=generator, device=device)
+        start = (update % per_pass) * batch_size
+        if start == 0:  # rows are gathered once a pass, so that batches are views
+            order = torch.randperm(total, generator=generator, device=generator.device)
+            shuffled = [part[order] for part in data]
         for group in optimiser.param_groups:
             group["lr"] = 0.5 * learning_rate * (1 + math.cos(math.pi * update / updates))
-        start = (update % per_pass) * batch_size
-        terms = loss(order[start : start + batch_size])
+        terms = loss(*(part[start : start + batch_size] for part in shuffled))
         optimiser.zero_grad(set_to_none=True)
         terms["loss"].backward()
         optimiser.step()
@@ -80,9 +82,10 @@ class Forward:
 
     def __call__(self, x: NDArray[np.float32]) -> NDArray[np.float32]:
         """(B, inputs) to (B, outputs), ReLU between the layers."""
-        for weight, bias in self.layers[:-1]:
-            x = x @ weight
+        last = len(self.layers) - 1
+        for depth, (weight, bias) in enumerate(self.layers):
+            x = np.dot(x, weight)
             x += bias
-            np.maximum(x, 0.0, out=x)
-        weight, bias = self.layers[-1]
-        return x @ weight + bias
+            if depth < last:
+                np.maximum(x, 0.0, out=x)
+        return x

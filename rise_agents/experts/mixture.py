@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rise_agents.agent import State, initial_state, merge_states
-from rise_agents.experts.batch import as_batch
+from rise_agents.readings import as_batch
 from rise_envs import streams
 from rise_envs.task import Task
 

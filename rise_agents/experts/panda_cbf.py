@@ -14,9 +14,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rise_agents.experts.batch import as_batch
 from rise_agents.experts.panda_model import DT, Scene, look, make_arm
 from rise_agents.experts.panda_steering import Steering, choose_side, make_program, steer
+from rise_agents.readings import as_batch
 from rise_envs.task import Task
 
 Array = NDArray[np.float64]

@@ -19,10 +19,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rise_agents.experts.batch import as_batch
 from rise_agents.experts.panda_cbf import check_steering, packed
 from rise_agents.experts.panda_model import DT, Arm, Scene, advance, look, make_arm
 from rise_agents.experts.panda_steering import Steering, choose_side, make_program
+from rise_agents.readings import as_batch
 from rise_envs import streams
 from rise_envs.task import Task
 

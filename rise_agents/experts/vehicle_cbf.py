@@ -30,9 +30,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rise_agents.experts.batch import as_batch
 from rise_agents.experts.planar_qp import nearest_point
 from rise_agents.experts.vehicle_guidance import Discs, Guidance, direction, dot, unit
+from rise_agents.readings import as_batch
 from rise_envs.ground_vehicle import Params
 from rise_envs.task import Task
 

@@ -30,8 +30,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rise_agents.experts import vehicle_cbf
-from rise_agents.experts.batch import as_batch
 from rise_agents.experts.vehicle_guidance import Discs
+from rise_agents.readings import as_batch
 from rise_envs.geometry import unicycle
 from rise_envs.task import Task
 
