@@ -29,7 +29,7 @@ from benchmarks.results import StrPath, SummaryRow, atomic_write_bytes
 _COLOURS = {"rise": "#0072B2", "pcbc": "#E69F00", "cppo": "#009E73", "expert": "#7F7F7F", "random": "#BDBDBD"}
 _SPARE_COLOURS = ("#D55E00", "#CC79A7", "#56B4E9", "#7B5BA6", "#8C6D1F")
 _MARKERS = "osD^vPX*<>"
-_INK, _FAINT, _GRID = "#222222", "#6A6A6A", "#E6E6E6"
+INK, FAINT, GRID = "#222222", "#6A6A6A", "#E6E6E6"
 _WIDTH = 10.0  # inches
 _INTERVALS = "95 % Wilson intervals"
 _LEGEND_LETTERS = 90  # that fit into its width
@@ -126,7 +126,7 @@ def noise_curve(summary: Sequence[SummaryRow], noise_model: str | None = None) -
         ncols=columns,
         columnspacing=1.6,
         fontsize=10.5,
-        labelcolor=_INK,
+        labelcolor=INK,
         frameon=False,
     )
     return figure
@@ -173,18 +173,16 @@ def _panels(
     below = (0.005, 0.01, 0.99, 0.99 - header / height)
     layout = ConstrainedLayoutEngine(rect=below, h_pad=0.08, w_pad=0.08)
     figure = Figure(figsize=(_WIDTH, height), layout=layout)
-    figure.text(0.015, 1 - 0.14 / height, title, va="top", size=14.5, weight="bold", color=_INK)
-    figure.text(0.015, 1 - 0.45 / height, "  ·  ".join(notes), va="top", size=10.5, color=_FAINT)
+    figure.text(0.015, 1 - 0.14 / height, title, va="top", size=14.5, weight="bold", color=INK)
+    figure.text(0.015, 1 - 0.45 / height, "  ·  ".join(notes), va="top", size=10.5, color=FAINT)
     axes = figure.subplots(len(envs), len(METRICS), squeeze=False).tolist()
     for env, pair in zip(envs, axes, strict=True):
         for axis, metric in zip(pair, METRICS, strict=True):
-            axis.set_title(
-                f"{env_label(env)}: {metric.title}", loc="left", size=12, weight="bold", color=_INK
-            )
+            axis.set_title(f"{env_label(env)}: {metric.title}", loc="left", size=12, weight="bold", color=INK)
             axis.spines[["top", "right"]].set_visible(False)
-            axis.tick_params(labelsize=10.5, colors=_INK)
-            axis.xaxis.label.set(size=10, color=_FAINT)
-            axis.yaxis.label.set(size=10, color=_FAINT)
+            axis.tick_params(labelsize=10.5, colors=INK)
+            axis.xaxis.label.set(size=10, color=FAINT)
+            axis.yaxis.label.set(size=10, color=FAINT)
             axis.set_axisbelow(True)
     return figure, axes
 
@@ -193,18 +191,18 @@ def _draw_bars(axis: Axes, agents: Sequence[str], rates: Mapping[str, Rate]) -> 
     """A horizontal bar per agent, top to bottom, its interval as a whisker and in figures beside it."""
     for place, agent in enumerate(agents):
         if agent not in rates:
-            axis.text(1, place, "not run", va="center", size=10, color=_FAINT, style="italic")
+            axis.text(1, place, "not run", va="center", size=10, color=FAINT, style="italic")
             continue
         rate, low, high = rates[agent]
         axis.barh(place, 100 * rate, height=0.66, color=colour(agents, agent))
         ends = [[100 * (rate - low)], [100 * (high - rate)]]
-        axis.errorbar(100 * rate, place, xerr=ends, color=_INK, elinewidth=1.4, capsize=3.5, capthick=1.4)
-        _beside(axis, place, 48, f"{percent(rate)} %", size=11, weight="bold", color=_INK)
-        _beside(axis, place, 110, interval(low, high), size=9.5, color=_FAINT)
+        axis.errorbar(100 * rate, place, xerr=ends, color=INK, elinewidth=1.4, capsize=3.5, capthick=1.4)
+        _beside(axis, place, 48, f"{percent(rate)} %", size=11, weight="bold", color=INK)
+        _beside(axis, place, 110, interval(low, high), size=9.5, color=FAINT)
     axis.set(xlim=(0, 101.5), ylim=(len(agents) - 0.4, -0.6))
     axis.set_yticks(range(len(agents)), [agent_label(agent) for agent in agents])
     axis.tick_params(axis="y", length=0)
-    axis.grid(axis="x", color=_GRID)
+    axis.grid(axis="x", color=GRID)
 
 
 def _beside(axis: Axes, place: float, points: float, words: str, **style: Any) -> None:
@@ -246,5 +244,5 @@ def _draw_lines(axis: Axes, lines: Mapping[str, Mapping[float, Rate]], styles: M
             axis.fill_between(levels, low, high, color=styles[agent]["color"], alpha=0.16, linewidth=0)
             axis.plot(levels, rate, clip_on=False, **styles[agent])  # whole markers at 0 and 100
     if not any(lines.values()):
-        axis.text(0.5, 0.5, "not run", transform=axis.transAxes, ha="center", color=_FAINT, style="italic")
-    axis.grid(color=_GRID)
+        axis.text(0.5, 0.5, "not run", transform=axis.transAxes, ha="center", color=FAINT, style="italic")
+    axis.grid(color=GRID)
