@@ -47,6 +47,7 @@ from rise_agents.vec_env import (
     make_training_env,
     random_inputs,
 )
+from rise_agents.workers import keep_freed_memory
 from rise_envs.task import Task
 
 FRAMES = (*readings.FRAMES, "raw")
@@ -344,6 +345,7 @@ def _linear(first: float, last: float) -> Callable[[float], float]:
 @contextmanager
 def _one_thread() -> Iterator[None]:
     """Networks this small lose time to a second thread; and one thread sums in one order."""
+    keep_freed_memory()
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
