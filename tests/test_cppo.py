@@ -12,10 +12,10 @@ import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from toy_envs import Bandit, Lever, Walk
 
-import rise_envs  # noqa: F401
 from rise_agents import cppo, load_agent, make_agent
 from rise_agents.agent import merge_states
 from rise_agents.cppo import CPPO
+from rise_envs import STAND_INS
 
 VEHICLE = "RISE-GroundVehicle-v0"
 SMALL = {"n_envs": 4, "n_steps": 32, "batch_size": 64, "n_epochs": 4, "hidden": [16], "total_steps": 256}
@@ -263,6 +263,12 @@ def test_readings_of_another_number_of_obstacles_are_refused():
     venv = gym.make_vec(VEHICLE, 4, autoreset_mode=AutoresetMode.SAME_STEP, n_obstacles=2)
     with pytest.raises(ValueError, match="'obstacle'"):
         make_agent("cppo", VEHICLE, SMALL).learn(venv)
+
+
+def test_a_stand_in_has_the_settings_of_what_it_models(monkeypatch):
+    monkeypatch.setitem(STAND_INS, "CartPole-v1", VEHICLE)
+    agent = make_agent("cppo", "CartPole-v1", {"frame": "raw"})
+    assert agent.config.n_envs == CPPO.PRESETS[VEHICLE]["n_envs"] != CPPO.Config.n_envs
 
 
 def test_presets_are_valid():
