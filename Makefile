@@ -5,10 +5,11 @@ BIN     = $(VENV)/bin
 STAMP   = $(VENV)/.installed
 ARGS   ?=
 
-.PHONY: bench test test-slow smoke lint format clean help
+.PHONY: bench speed test test-slow smoke lint format clean help
 
 help:
 	@echo "make bench      install, then demonstrations, training, 1,000 noisy scenarios, tables, figures, videos"
+	@echo "make speed      speed against the peers, into docs/performance.md"
 	@echo "make test       install, then all fast tests"
 	@echo "make test-slow  the tests that take minutes"
 	@echo "make smoke      the whole benchmark in miniature"
@@ -26,6 +27,9 @@ bench: $(STAMP)
 
 smoke: $(STAMP)
 	$(BIN)/python -m benchmarks.run --agents rise pcbc cppo --preset smoke $(ARGS)
+
+speed: $(STAMP)
+	$(BIN)/python -m benchmarks.speed --docs docs/performance.md $(ARGS)
 
 test: $(STAMP)
 	$(BIN)/python -m pytest -n auto $(ARGS)

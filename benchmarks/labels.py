@@ -11,7 +11,10 @@ if TYPE_CHECKING:
 
 REFERENCES = ("expert", "random")  # rows to compare with, not agents under test
 _AGENTS = {"rise": "RISE", "pcbc": "PC-BC", "cppo": "C-PPO", "expert": "Expert", "random": "Random"}
-_ENVS = {"RISE-SafePanda-v0": "Franka Panda"}  # others are read off their id
+_ENVS = {  # others are read off their id
+    "RISE-SafePanda-v0": "Franka Panda",
+    "RISE-SafePandaKinematic-v0": "Franka Panda, kinematic model",
+}
 _NOISE = {
     "step": "fresh noise at every step",
     "episode": "one constant error per episode",

@@ -44,7 +44,9 @@ def parser() -> Parser:
         metavar="NAME",
         help="agents to compare; 'expert' and 'random' add reference rows (default: rise pcbc cppo)",
     )
-    p.add_argument("--envs", nargs="+", metavar="ID", help="environments (default: all of the suite)")
+    p.add_argument(
+        "--envs", nargs="+", metavar="ID", help="environments (default: all whose results are reported)"
+    )
     p.add_argument(
         "--preset",
         default="quick",
@@ -113,13 +115,14 @@ def parse_settings(texts: Sequence[str]) -> dict[str, dict[str, Any]]:
 def plan_of(arguments: argparse.Namespace) -> Plan:
     """The plan that the arguments ask for, every setting checked before any work starts."""
     from benchmarks.jobs import check_settings
-    from rise_envs import ENVS
+    from rise_envs import ENVS, STAND_INS
 
+    reported = [env for env in ENVS if env not in STAND_INS]
     plan = make_plan(
         arguments.preset,
         parse_settings(arguments.settings),
         agents=tuple(dict.fromkeys(arguments.agents)),
-        envs=tuple(dict.fromkeys(arguments.envs or ENVS)),
+        envs=tuple(dict.fromkeys(arguments.envs or reported)),
         demos=arguments.demos,
         episodes=arguments.episodes,
         noise_model=arguments.noise_model,

@@ -17,7 +17,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from rise_envs import streams
+from rise_envs import STAND_INS, streams
 
 State = tuple[NDArray, ...] | None
 # Reports training progress: (share done in [0, 1], named figures of this moment).
@@ -113,8 +113,12 @@ def _check_kind(key: str, value: Any, default: Any) -> None:
 
 
 def make_config(kind: Any, env_id: str, values: dict[str, Any]) -> Any:
-    """The complete settings of an agent class for an environment: its defaults there, with ``values`` over them."""
-    return config_from_dict(kind.Config, {**kind.PRESETS.get(env_id, {}), **values})
+    """The complete settings of an agent class for an environment: its defaults there, with ``values`` over them.
+
+    What stands in for an environment has that environment's defaults.
+    """
+    preset = kind.PRESETS.get(STAND_INS.get(env_id, env_id), {})
+    return config_from_dict(kind.Config, {**preset, **values})
 
 
 def config_to_dict(config: Any) -> dict[str, Any]:

@@ -19,6 +19,8 @@ from rise_agents import checkpoint, readings
 from rise_agents.agent import config_to_dict, require, require_widths
 from rise_agents.demonstrations import Demonstrations
 from rise_agents.readings import Standardiser
+from rise_agents.training import Layer, rescaled
+from rise_agents.workers import keep_freed_memory
 from rise_envs.task import Task, env_class, task_of
 
 LOSSES = ("mse", "nll")
@@ -77,19 +79,23 @@ class ActionUnits:
         """Actions in their own units to [−1, 1]."""
         return 2 * (action - self.low) / (self.high - self.low) - 1
 
-    @cached_property
-    def _half(self) -> NDArray[np.float64]:
-        return 0.5 * (self.high - self.low)
-
     def to_action(self, unit: NDArray) -> NDArray[np.float32]:
-        """Clipped to [−1, 1] and back to the action's own units, inside the bounds."""
-        action = self.low + (clipped(unit) + 1.0) * self._half
-        return action.astype(np.float32)  # which takes the bounds' rounding error back, too
+        """Actions in [−1, 1] to their own units."""
+        return self.clip((self.low + (unit + 1.0) * 0.5 * (self.high - self.low)).astype(np.float32))
 
+    def answering(self, layer: Layer) -> Layer:
+        """A network's last ``layer``, of actions in [−1, 1] (and deviations), such that it gives actions."""
+        half = 0.5 * (self.high - self.low)
+        return rescaled(layer, half, self.low + half)
 
-def clipped(unit: NDArray) -> NDArray:
-    """Clipped to [−1, 1] (``np.clip`` takes three times as long for a single action)."""
-    return np.minimum(np.maximum(unit, -1.0), 1.0)
+    def clip(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Actions inside the bounds (``np.clip`` takes twice as long for a single one)."""
+        low, high = self._bounds
+        return np.minimum(np.maximum(action, low), high)
+
+    @cached_property
+    def _bounds(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        return self.low.astype(np.float32), self.high.astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -116,22 +122,14 @@ class Eyes:
         robot, reading = readings.inputs(task, frame, demonstrations.observations)
         return cls(task, frame, Standardiser.fit(robot), Standardiser.fit(reading))
 
-    @cached_property
-    def _units(self) -> Standardiser:
-        """Of robot and reading inputs side by side."""
-        parts = self.robot, self.reading
-        return Standardiser(
-            *(np.concatenate([getattr(p, name) for p in parts]) for name in ("mean", "scale"))
-        )
-
-    def see(self, observation: dict[str, NDArray]) -> NDArray[np.float32]:
-        """Batched observations to robot and reading inputs side by side, (B, R + C)."""
-        return self._units(np.concatenate(readings.inputs(self.task, self.frame, observation), -1))
+    def inputs(self, observation: dict[str, NDArray]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Batched observations to robot inputs (B, R) and reading inputs (B, C), in their own units."""
+        return readings.inputs(self.task, self.frame, observation)
 
     def __call__(self, observation: dict[str, NDArray]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Batched observations to robot inputs (B, R) and reading inputs (B, C)."""
-        seen, size = self.see(observation), len(self.robot.mean)
-        return seen[:, :size], seen[:, size:]
+        """The same in standard units."""
+        robot, reading = self.inputs(observation)
+        return self.robot(robot), self.reading(reading)
 
     def arrays(self) -> dict[str, NDArray]:
         """The numbers to store."""
@@ -183,6 +181,7 @@ def output_size(actions: int, kind: str) -> int:
 
 def seeded(seed: int, device: str) -> torch.Generator:
     """A generator on the training device; also seeds the initial weights of modules made from here on."""
+    keep_freed_memory()
     torch.manual_seed(seed)
     torch.set_num_threads(1)  # a second thread makes networks of this size slower, not faster
     return torch.Generator(device=device).manual_seed(seed)

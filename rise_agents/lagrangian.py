@@ -111,7 +111,9 @@ class ConstrainedPPO(PPO):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(int(self.cost_rng.integers(2**31)))
             self.cost_critic = mlp(self.rollout_buffer.obs_shape[0], self.cost_hidden, 1).to(self.device)
-        self.cost_optimizer = torch.optim.Adam(self.cost_critic.parameters(), self.lr_schedule(1), eps=1e-5)
+        self.cost_optimizer = torch.optim.Adam(
+            self.cost_critic.parameters(), self.lr_schedule(1), eps=1e-5, fused=True
+        )
         unused = spaces.Box(0, 1, (1,))
         self._cost_buffer = RolloutBuffer(
             *(self.n_steps, unused, unused),

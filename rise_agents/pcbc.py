@@ -18,7 +18,7 @@ from rise_agents.agent import Progress, State, make_config, silent
 from rise_agents.cloning import ActionUnits, CloningConfig, Eyes
 from rise_agents.networks import mlp
 from rise_agents.readings import as_batch, check_finite
-from rise_agents.training import Forward, fit, to_arrays
+from rise_agents.training import Forward, fit, layers_of, standardised, to_arrays
 
 Config = CloningConfig
 
@@ -66,8 +66,14 @@ class PCBC:
 
     def _use(self, arrays: dict[str, NDArray]) -> PCBC:
         self._arrays = arrays
-        self._eyes = Eyes.from_arrays(self.task, self.config.frame, arrays)
-        self._policy = Forward(arrays, "policy")
+        self._eyes = eyes = Eyes.from_arrays(self.task, self.config.frame, arrays)
+        first, *rest = layers_of(arrays, "policy")
+        mean, scale = (
+            np.concatenate([getattr(part, name) for part in (eyes.robot, eyes.reading)])
+            for name in ("mean", "scale")
+        )
+        # It acts in the units of inputs and actions, which saves their conversion at every step.
+        self._policy = Forward([standardised(first, mean, scale), *rest[:-1], self.units.answering(rest[-1])])
         return self
 
     def predict(
@@ -82,8 +88,7 @@ class PCBC:
             raise cloning.untrained(self.name)
         rows, single = as_batch(observation)
         check_finite(rows)
-        output = self._policy(self._eyes.see(rows))
-        action = self.units.to_action(output[:, : len(self.units.low)])
+        action = self.units.clip(self._policy(*self._eyes.inputs(rows)))
         return (action[0] if single else action), None
 
     def save(self, path: str | os.PathLike[str]) -> None:

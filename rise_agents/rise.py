@@ -39,8 +39,12 @@ from rise_agents.agent import (
 )
 from rise_agents.cloning import ActionUnits, CloningConfig, CloningData, Eyes
 from rise_agents.networks import LOG_SIGMA_RANGE, Encoder, gaussian_kl, mlp, reparameterise
-from rise_agents.training import Forward, fit, to_arrays
+from rise_agents.training import Forward, fit, layers_of, standardised, to_arrays
 from rise_envs import streams
+
+_ONE = np.uint64(1)
+_AHEAD = 64  # steps whose draws are computed together where one episode acts alone
+_LOG_SIGMA_RANGE = tuple(np.float32(bound) for bound in LOG_SIGMA_RANGE)
 
 
 @dataclass(frozen=True)
@@ -226,24 +230,26 @@ class Rise:
     def _use(self, arrays: dict[str, NDArray]) -> Rise:
         self._arrays = arrays
         self._eyes = Eyes.from_arrays(self.task, self.config.frame, arrays)
-        self._trunk, self._policy = Forward(arrays, "vae.encoder.trunk"), Forward(arrays, "policy")
-        # Both heads side by side, in the policy's units: μ / spread and log σ − log spread.
-        shift, heads = np.log(arrays["vae.spread"]), ("vae.encoder.mu", "vae.encoder.log_sigma")
-        mu_scale = np.concatenate((1 / arrays["vae.spread"], np.ones_like(shift)))
-        self._head = np.concatenate([arrays[f"{head}.weight"].T for head in heads], 1) * mu_scale
-        self._head_bias = np.concatenate([arrays[f"{head}.bias"] for head in heads]) * mu_scale
-        self._head_bias[len(shift) :] -= shift
-        self._log_sigma_range = tuple(bound - shift for bound in LOG_SIGMA_RANGE)
+        # The networks act in the units of inputs, latent and actions, which saves their conversion at every step.
+        first, *rest = layers_of(arrays, "vae.encoder.trunk")
+        heads = [
+            np.concatenate([arrays[f"vae.encoder.{head}.{part}"] for head in ("mu", "log_sigma")]).T
+            for part in ("weight", "bias")
+        ]
+        units = self._eyes.reading
+        self._encoder = Forward([standardised(first, units.mean, units.scale), *rest, (heads[0], heads[1])])
+        first, *rest = layers_of(arrays, "policy")
+        units, spread = self._eyes.robot, arrays["vae.spread"]
+        mean, scale = np.append(units.mean, 0 * spread), np.append(units.scale, spread)
+        self._policy = Forward([standardised(first, mean, scale), *rest[:-1], self.units.answering(rest[-1])])
+        self._ahead: tuple[tuple[int, int], NDArray] = (0, -1), np.zeros(0)
         return self
 
-    def encode(self, reading: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """The posterior of readings in standard units (B, C): μ and σ, each (B, Z), in the policy's units."""
-        features = self._trunk(reading)
-        np.maximum(features, 0.0, out=features)
-        heads = np.dot(features, self._head)
-        heads += self._head_bias
-        low, high = self._log_sigma_range
-        return heads[:, : len(low)], np.exp(np.minimum(np.maximum(heads[:, len(low) :], low), high))
+    def encode(self, reading: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """The posterior of readings in their own units (B, C): μ and σ, each (B, Z)."""
+        heads, size = self._encoder(reading), self.config.latent
+        low, high = _LOG_SIGMA_RANGE
+        return heads[:, :size], np.exp(np.minimum(np.maximum(heads[:, size:], low), high))
 
     def initial_state(self, keys: NDArray[np.uint64]) -> State:
         """Streams of posterior samples for episodes with the given keys (B,)."""
@@ -268,28 +274,37 @@ class Rise:
             raise cloning.untrained(self.name)
         rows, single = readings.as_batch(observation)
         readings.check_finite(rows)
-        robot, reading = self._eyes(rows)
+        robot, reading = self._eyes.inputs(rows)
         mu, sigma = self.encode(reading)
         if deterministic:
-            unit = self._act(robot, mu)
+            action = self._act(robot, mu)
         else:
             keys, counter = draw_state(state, episode_start, len(mu), self._rng)
-            size, average = mu.shape[1], self.config.average
-            draws = counter[:, None] * np.uint64(average * size) + np.arange(average * size, dtype=np.uint64)
-            epsilon = streams.normal(keys[:, None], draws).astype(np.float32)
-            unit = self._act(robot, mu + sigma * epsilon[:, :size])
-            for k in range(1, average):
-                unit += self._act(robot, mu + sigma * epsilon[:, k * size : (k + 1) * size])
-            if average > 1:
-                unit /= average
-            state = (keys, counter + np.uint64(1))
-        action = self.units.to_action(unit)
+            epsilon, size = self._draws(keys, counter), self.config.latent
+            action = self._act(robot, mu + sigma * epsilon[:, :size])
+            for k in range(1, self.config.average):
+                action += self._act(robot, mu + sigma * epsilon[:, k * size : (k + 1) * size])
+            if self.config.average > 1:
+                action /= self.config.average
+            state = (keys, counter + _ONE)
         return (action[0] if single else action), state
 
-    def _act(self, robot: NDArray[np.float32], z: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Clipped unit actions of π(s, g, z)."""
-        output = self._policy(np.concatenate((robot, z), -1))
-        return cloning.clipped(output[:, : len(self.units.low)])
+    def _act(self, robot: NDArray, z: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Actions of π(s, g, z) inside the bounds."""
+        return self.units.clip(self._policy(robot, z))
+
+    def _draws(self, keys: NDArray[np.uint64], counter: NDArray[np.uint64]) -> NDArray[np.float32]:
+        """Standard normal ε of steps ``counter`` (B,) of the streams ``keys`` (B,): (B, average · Z)."""
+        size = self.config.average * self.config.latent
+        if len(keys) > 1 or not counter[0]:
+            return _normal(keys, counter, size)
+        # An episode on its own: its next steps' draws together cost little more than one step's.
+        block, place = divmod(int(counter[0]), _AHEAD)
+        mark = int(keys[0]), block
+        if self._ahead[0] != mark:
+            steps = block * _AHEAD + np.arange(_AHEAD, dtype=np.uint64)
+            self._ahead = mark, _normal(keys, steps, size)
+        return self._ahead[1][place : place + 1]
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Store the agent; :func:`rise_agents.load_agent` reads it."""
@@ -299,3 +314,9 @@ class Rise:
     def from_checkpoint(cls, arrays: dict[str, NDArray], description: dict[str, Any], device: str) -> Rise:
         """The agent that :meth:`save` stored."""
         return cls(description["env"], description["config"], description["seed"], device)._use(arrays)
+
+
+def _normal(keys: NDArray[np.uint64], steps: NDArray[np.uint64], size: int) -> NDArray[np.float32]:
+    """Draws number steps · size and following, (T, size), of each step's stream: ``keys`` are (T,) or (1,)."""
+    numbers = steps[:, None] * np.uint64(size) + np.arange(size, dtype=np.uint64)
+    return streams.normal(keys[:, None], numbers).astype(np.float32)

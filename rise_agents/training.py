@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
@@ -12,6 +13,7 @@ from torch import Tensor, nn
 
 # Maps a batch, (B, …) each, to named terms, of which ``loss`` is minimised.
 Loss = Callable[..., dict[str, Tensor]]
+_ZERO = np.float32(0)
 
 
 def fit(
@@ -46,7 +48,7 @@ def fit(
         start = (update % per_pass) * batch_size
         if start == 0:  # rows are gathered once a pass, so that batches are views
             order = torch.randperm(total, generator=generator, device=generator.device)
-            shuffled = [part[order] for part in data]
+            shuffled = [part.index_select(0, order) for part in data]
         for group in optimiser.param_groups:
             group["lr"] = 0.5 * learning_rate * (1 + math.cos(math.pi * update / updates))
         terms = loss(*(part[start : start + batch_size] for part in shuffled))
@@ -64,28 +66,49 @@ def to_arrays(module: nn.Module, name: str) -> dict[str, NDArray[np.float32]]:
     }
 
 
+Layer = tuple[NDArray[np.float64], NDArray[np.float64]]  # weights (inputs, outputs) and bias (outputs,)
+
+
+def layers_of(arrays: dict[str, NDArray], name: str) -> list[Layer]:
+    """The fully connected layers that :func:`to_arrays` stored under ``name``, first to last."""
+    own = [key.removeprefix(f"{name}.") for key in arrays if key.startswith(f"{name}.")]
+    numbers = sorted({int(key.split(".")[0]) for key in own if re.fullmatch(r"\d+\.weight", key)})
+    stored = [(arrays[f"{name}.{i}.weight"].T, arrays[f"{name}.{i}.bias"]) for i in numbers]
+    return [(weight.astype(np.float64), bias.astype(np.float64)) for weight, bias in stored]
+
+
+def standardised(layer: Layer, mean: NDArray, scale: NDArray) -> Layer:
+    """``layer`` such that it takes x instead of (x − mean) / scale."""
+    weight, bias = layer
+    weight = weight / scale[:, None]
+    return weight, bias - mean @ weight
+
+
+def rescaled(layer: Layer, scale: NDArray, shift: NDArray) -> Layer:
+    """``layer`` such that it gives scale · y + shift instead of y; of outputs beyond those of ``scale``, none."""
+    weight, bias = (part[..., : len(scale)] * scale for part in layer)
+    return weight, bias + shift
+
+
 class Forward:
-    """A trained multilayer perceptron in plain NumPy: no graph, no module, a few microseconds a call."""
+    """A trained multilayer perceptron in plain NumPy: no graph, no module, a few microseconds a call.
 
-    def __init__(self, arrays: dict[str, NDArray], name: str) -> None:
-        layers = sorted(
-            {
-                int(key.split(".")[-2])
-                for key in arrays
-                if key.startswith(f"{name}.") and key.endswith("weight")
-            }
-        )
-        # Transposed once, in the layout that a row vector times a matrix reads in order.
-        self.layers = [
-            (np.ascontiguousarray(arrays[f"{name}.{i}.weight"].T), arrays[f"{name}.{i}.bias"]) for i in layers
-        ]
+    A bias is a row of its layer's matrix that meets a constant 1. Hidden layers hand this 1 on (ReLU leaves it as
+    it is), so that a layer costs two calls: on a single observation it is calls that take the time.
+    """
 
-    def __call__(self, x: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(B, inputs) to (B, outputs), ReLU between the layers."""
-        last = len(self.layers) - 1
-        for depth, (weight, bias) in enumerate(self.layers):
-            x = np.dot(x, weight)
-            x += bias
-            if depth < last:
-                np.maximum(x, 0.0, out=x)
-        return x
+    def __init__(self, layers: Sequence[Layer]) -> None:
+        matrices = [np.vstack(layer).astype(np.float32) for layer in layers]
+        for depth, matrix in enumerate(matrices[:-1]):
+            one = np.zeros((len(matrix), 1), np.float32)
+            one[-1] = 1.0
+            matrices[depth] = np.hstack((matrix, one))
+        self.hidden, self.last = matrices[:-1], matrices[-1]
+
+    def __call__(self, *parts: NDArray) -> NDArray[np.float32]:
+        """The parts of the inputs, (B, ·) each, to outputs (B, ·); ReLU between the layers."""
+        x = np.concatenate((*parts, np.ones((len(parts[0]), 1))), -1, dtype=np.float32, casting="same_kind")
+        for matrix in self.hidden:
+            x = np.dot(x, matrix)
+            np.maximum(x, _ZERO, out=x)
+        return np.dot(x, self.last)

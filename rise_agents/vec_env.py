@@ -143,8 +143,9 @@ class Bridge(VecEnv):
         observation, reward, terminated, truncated, infos = self.venv.step(self._actions)
         dones = terminated | truncated
         self.costs = step_costs(infos, dones)
-        self._sums += np.stack((reward, np.ones_like(reward), self.costs))
-        notes: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        for total, part in zip(self._sums, (reward, 1.0, self.costs), strict=True):
+            total += part
+        notes: list[dict[str, Any]] = [{}] * self.num_envs  # one empty dict: SB3 only reads
         ended = np.flatnonzero(dones)
         if len(ended):
             last = self.encode(_stacked([infos["final_obs"][i] for i in ended]))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
 import multiprocessing
 import os
+import sys
 from concurrent.futures import ProcessPoolExecutor
 
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -21,6 +23,19 @@ def limit_threads() -> None:
     """
     for name in _THREADS:
         os.environ.setdefault(name, "1")
+
+
+def keep_freed_memory() -> None:
+    """Let the C library keep up to 256 MiB that this process frees, where it is glibc.
+
+    It hands the activations of a batch back to the system after every update, which clears and maps them anew for
+    the next one: of a RISE update that was a third of the time.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
+    if mallopt:
+        trim_threshold, mmap_threshold = -1, -3  # as malloc.h numbers them
+        mallopt(trim_threshold, 256 << 20)
+        mallopt(mmap_threshold, 32 << 20)  # the largest that it accepts
 
 
 def make_pool(workers: int) -> ProcessPoolExecutor:

@@ -12,10 +12,10 @@ import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from toy_envs import Bandit, Lever, Walk
 
-import rise_envs  # noqa: F401
-from rise_agents import load_agent, make_agent
+from rise_agents import cppo, load_agent, make_agent
 from rise_agents.agent import merge_states
 from rise_agents.cppo import CPPO
+from rise_envs import STAND_INS
 
 VEHICLE = "RISE-GroundVehicle-v0"
 SMALL = {"n_envs": 4, "n_steps": 32, "batch_size": 64, "n_epochs": 4, "hidden": [16], "total_steps": 256}
@@ -213,6 +213,7 @@ def test_an_untrained_agent_says_so(observations, tmp_path):
     ("settings", "message"),
     [
         ({"frame": "boddy"}, "did you mean 'body'"),
+        ({"train_env": "RISE-GroundVehicl-v0"}, "train_env: .*RISE-GroundVehicle"),
         ({"total_step": 5}, "did you mean 'total_steps'"),
         ({"n_envs": 0}, "n_envs must be"),
         ({"n_steps": 2.5}, "n_steps must be"),
@@ -230,6 +231,29 @@ def test_bad_settings_are_named(settings, message):
         make_agent("cppo", VEHICLE, settings)
 
 
+@pytest.mark.parametrize(
+    ("source", "train_env", "used"),
+    [
+        (None, "", VEHICLE),
+        (VEHICLE, "", VEHICLE),
+        (None, "CartPole-v1", "CartPole-v1"),
+        (VEHICLE, "CartPole-v1", "CartPole-v1"),
+        ("RISE-SafePanda-v0", "CartPole-v1", "RISE-SafePanda-v0"),
+    ],
+)
+def test_it_trains_where_it_is_told_to(monkeypatch, source, train_env, used):
+    """An environment that is asked for by name wins over the setting, the setting over the agent's own."""
+    asked = []
+
+    def make(env_id, n_envs):
+        asked.append((env_id, n_envs))
+        return gym.make_vec(VEHICLE, n_envs, autoreset_mode=AutoresetMode.SAME_STEP)
+
+    monkeypatch.setattr(cppo, "make_training_env", make)
+    agent = make_agent("cppo", VEHICLE, {**SMALL, "train_env": train_env}).learn(source)
+    assert asked == [(used, 4)] and agent.env_id == VEHICLE
+
+
 def test_frames_need_a_task():
     with pytest.raises(ValueError, match="raw"):
         make_agent("cppo", "CartPole-v1")
@@ -239,6 +263,12 @@ def test_readings_of_another_number_of_obstacles_are_refused():
     venv = gym.make_vec(VEHICLE, 4, autoreset_mode=AutoresetMode.SAME_STEP, n_obstacles=2)
     with pytest.raises(ValueError, match="'obstacle'"):
         make_agent("cppo", VEHICLE, SMALL).learn(venv)
+
+
+def test_a_stand_in_has_the_settings_of_what_it_models(monkeypatch):
+    monkeypatch.setitem(STAND_INS, "CartPole-v1", VEHICLE)
+    agent = make_agent("cppo", "CartPole-v1", {"frame": "raw"})
+    assert agent.config.n_envs == CPPO.PRESETS[VEHICLE]["n_envs"] != CPPO.Config.n_envs
 
 
 def test_presets_are_valid():

@@ -18,6 +18,8 @@ import pytest
 from benchmarks.protocol import PRESETS, make_plan
 from benchmarks.results import SCHEMA, SummaryRow
 from benchmarks.run import parser
+from benchmarks.speed.page import replace_block
+from benchmarks.speed.rows import ROWS
 from rise_agents import AGENTS, agent_class, readings
 from rise_agents.agent import make_config
 from rise_agents.cloning import CloningConfig
@@ -330,3 +332,15 @@ def test_the_table_of_seeds_agrees_with_the_splits():
 def test_the_tables_of_columns_agree_with_the_files():
     assert columns_after("benchmark.md", "`episodes.parquet`:") == SCHEMA.names
     assert columns_after("benchmark.md", "`summary.csv` (") == [field.name for field in fields(SummaryRow)]
+
+
+# --- performance -----------------------------------------------------------------------------------------------
+
+
+def test_every_row_of_the_speed_table_is_explained():
+    assert [row[0] for row in table("performance.md", "name", "ours", "peer")] == list(ROWS)
+
+
+def test_the_performance_page_can_be_renewed():
+    text = (DOCS / "performance.md").read_text()
+    assert replace_block(text, "new") != text  # it has its one block

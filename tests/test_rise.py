@@ -100,13 +100,45 @@ def test_encoder_in_numpy_equals_torch(trained):
         k.removeprefix("vae.encoder."): v for k, v in trained._arrays.items() if k.startswith("vae.encoder.")
     }
     encoder.load_state_dict({key: torch.from_numpy(value) for key, value in own.items()})
-    reading = np.random.default_rng(0).normal(size=(20, 5)).astype(np.float32)
+    units = trained._eyes.reading
+    reading = units.mean + units.scale * np.random.default_rng(0).normal(size=(20, 5))
     mu, sigma = trained.encode(reading)
     with torch.no_grad():
-        expected_mu, expected_log_sigma = encoder(torch.from_numpy(reading))
-    spread = trained._arrays["vae.spread"]
-    np.testing.assert_allclose(mu * spread, expected_mu, rtol=1e-4, atol=1e-5)
-    np.testing.assert_allclose(sigma * spread, expected_log_sigma.exp(), rtol=1e-4, atol=1e-5)
+        expected_mu, expected_log_sigma = encoder(torch.from_numpy(units(reading)))
+    np.testing.assert_allclose(mu, expected_mu, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(sigma, expected_log_sigma.exp(), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("loss", ["mse", "nll"])
+def test_policy_in_numpy_equals_torch(vehicle_demonstrations, loss):
+    """In the units of inputs, latent and actions: what training sees in standard units gives the same action."""
+    agent = make_agent("rise", VEHICLE, {**BRIEF, "loss": loss}, seed=2).learn(vehicle_demonstrations)
+    observation = vehicle_demonstrations.subsample(200)
+    mu, _ = agent.encode(agent._eyes.inputs(observation)[1])
+    robot, _ = agent._eyes(observation)
+    policy = mlp(robot.shape[1] + mu.shape[1], agent.config.hidden, cloning.output_size(2, loss))
+    own = {k.removeprefix("policy."): v for k, v in agent._arrays.items() if k.startswith("policy.")}
+    policy.load_state_dict({key: torch.from_numpy(value) for key, value in own.items()})
+    with torch.no_grad():
+        unit = policy(torch.from_numpy(np.concatenate((robot, mu / agent._arrays["vae.spread"]), -1)))
+    action, _ = agent.predict(observation, deterministic=True)
+    expected = agent.units.to_action(unit.numpy()[:, :2])
+    np.testing.assert_allclose(action, expected, rtol=1e-4, atol=1e-4)
+
+
+def test_an_episode_alone_draws_what_it_draws_in_company(trained, vehicle_demonstrations):
+    """The draws of a lone episode are computed ahead, step by step they are those of its own stream."""
+    observation = {key: value[:3] for key, value in vehicle_demonstrations.observations.items()}
+    lone = {key: value[1:2] for key, value in observation.items()}
+    keys = np.array([7, 8, 9], np.uint64)
+    together, alone = trained.initial_state(keys), trained.initial_state(keys[1:2])
+    for step in range(150):
+        actions, together = trained.predict(observation, together)
+        action, alone = trained.predict(lone, alone)
+        np.testing.assert_allclose(action[0], actions[1], rtol=1e-5, atol=1e-6)
+        if step % 50 == 20:  # another stream in between changes nothing
+            trained.predict(lone, trained.initial_state(keys[:1]))
+            trained.predict(lone, (keys[:1], np.array([step], np.uint64)))
 
 
 def test_inference_draws_z_from_the_posterior(trained, vehicle_demonstrations, monkeypatch):
@@ -117,7 +149,7 @@ def test_inference_draws_z_from_the_posterior(trained, vehicle_demonstrations, m
     act = trained._act
     monkeypatch.setattr(trained, "_act", lambda robot, z: drawn.append(z) or act(robot, z))
     trained.predict(one, state=trained.initial_state(np.arange(rows, dtype=np.uint64)))
-    mu, sigma = trained.encode(trained._eyes(one)[1][:1])
+    mu, sigma = trained.encode(trained._eyes.inputs(one)[1][:1])
     epsilon = (drawn[0] - mu) / sigma
     np.testing.assert_allclose(epsilon.mean(0), 0, atol=0.03)
     np.testing.assert_allclose(np.cov(epsilon.T), np.eye(epsilon.shape[1]), atol=0.03)
@@ -125,8 +157,8 @@ def test_inference_draws_z_from_the_posterior(trained, vehicle_demonstrations, m
 
 def test_deterministic_acts_on_the_posterior_mean(trained, vehicle_demonstrations):
     observation = {key: value[:9] for key, value in vehicle_demonstrations.observations.items()}
-    robot, reading = trained._eyes(observation)
-    expected = trained.units.to_action(trained._act(robot, trained.encode(reading)[0]))
+    robot, reading = trained._eyes.inputs(observation)
+    expected = trained._act(robot, trained.encode(reading)[0])
     action, _ = trained.predict(observation, deterministic=True)
     np.testing.assert_array_equal(action, expected)
 
@@ -176,5 +208,6 @@ def test_a_collapsed_latent_reaches_the_policy_with_unit_scale(vehicle_demonstra
     agent = make_agent("rise", VEHICLE, {**BRIEF, "beta": 1e4, "vae_updates": 400}).learn(
         vehicle_demonstrations
     )
-    mu, sigma = agent.encode(agent._eyes(vehicle_demonstrations.observations)[1])
-    np.testing.assert_allclose(np.sqrt(mu.var(0) + (sigma**2).mean(0)), 1.0, rtol=1e-3)
+    mu, sigma = agent.encode(agent._eyes.inputs(vehicle_demonstrations.observations)[1])
+    spread = np.sqrt(mu.var(0) + (sigma**2).mean(0))
+    np.testing.assert_allclose(agent._arrays["vae.spread"], spread, rtol=1e-3)

@@ -13,8 +13,9 @@ from benchmarks import results
 from benchmarks.executors import run_jobs
 from benchmarks.jobs import Job
 from benchmarks.protocol import PRESETS, make_plan
-from benchmarks.run import main
+from benchmarks.run import main, parser, plan_of
 from rise_agents.seeds import SPLITS
+from rise_envs import ENVS, STAND_INS
 
 VEHICLE = "RISE-GroundVehicle-v0"
 SMALL = ["--agents", "rise", "pcbc", "random", "--envs", VEHICLE, "--preset", "smoke", "--expert", "cbf"]
@@ -26,6 +27,14 @@ def run(tmp_path_factory):
     out = tmp_path_factory.mktemp("run")
     assert main([*SMALL, "--workers", "1", "--out", str(out)]) == 0
     return out
+
+
+def test_stand_ins_are_evaluated_only_when_asked_for(monkeypatch):
+    monkeypatch.setitem(STAND_INS, "RISE-Standin-v0", VEHICLE)
+    monkeypatch.setitem(ENVS, "RISE-Standin-v0", ENVS[VEHICLE])
+    assert plan_of(parser().parse_args([])).envs == (VEHICLE, "RISE-SafePanda-v0")
+    plan = plan_of(parser().parse_args(["--envs", "RISE-Standin-v0", "--agents", "expert"]))
+    assert plan.rows("RISE-Standin-v0") == [("expert-cbf", 0), ("expert-mpc", 0), ("expert-mixture", 0)]
 
 
 def test_every_promised_file_is_there(run):

@@ -30,7 +30,7 @@ def parser() -> Parser:
     """The command line."""
     p = Parser(
         prog="python -m benchmarks.speed",
-        description="Measure the suite's speed against its peers, in turn, on one core.",
+        description="Measure the suite's speed against its peers, in turn.",
         epilog=_EXAMPLES,
     )
     p.add_argument(
@@ -94,8 +94,8 @@ def measure_all(names: Sequence[str], arguments: argparse.Namespace, out: Path) 
                 except measure.Unavailable as error:
                     results.append(measure.not_measured(row, str(error)))
                 except Exception as error:
-                    results.append(measure.not_measured(row, throughput.reason(error)))
-                    wrong.append(f"{name}: {throughput.reason(error)}")
+                    results.append(measure.not_measured(row, measure.reason(error)))
+                    wrong.append(f"{name}: {measure.reason(error)}")
     if results:
         measure.write_csv(out / "speed.csv", results)
     atomic_write_text(out / "machine.txt", page.machine() + "\n")

@@ -79,7 +79,7 @@ def cloning(effort: Effort, name: str) -> Iterator[Sides]:
 
     torch.set_num_threads(1)
     data = recorded()
-    updates = effort.size(100, 10)
+    updates = effort.size(200, 10)
     encoder = {"vae_updates": 1} if name == "rise" else {}
     agent: Any = make_agent(name, VEHICLE, {"updates": updates, "batch_size": BATCH, **encoder})
     config = agent.config

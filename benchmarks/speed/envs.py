@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import gc
+import time
 import tracemalloc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -14,6 +16,7 @@ from gymnasium.vector import VectorEnv
 
 import rise_envs  # noqa: F401  registers the environments
 from benchmarks.speed.measure import Effort, Sides, Unavailable, paced, rate
+from rise_agents.workers import available_cores
 from rise_envs.panda_sim import silence
 
 VEHICLE, PANDA, ARMS = "RISE-GroundVehicle-v0", "RISE-SafePanda-v0", "RISE-SafePandaKinematic-v0"
@@ -65,7 +68,7 @@ def steps_together(env: VectorEnv, env_id: str, device: str | None = None) -> Wo
     cycle = min(limit or 200, 200) + 1  # one step of autoreset
     env.action_space.seed(0)
     actions: list[Any] = [env.action_space.sample() for _ in range(_ACTIONS)]
-    finish = str  # nothing
+    finish: Callable[[], Any] = str  # nothing
     if device:
         import torch
 
@@ -116,20 +119,20 @@ def vehicles(effort: Effort) -> Iterator[Sides]:
 
 
 def make_torch_vehicles(count: int, device: str) -> VectorEnv:
-    """Batched vehicles on a torch device, their step compiled."""
+    """Batched vehicles on a torch device; on the CPU they share its cores."""
     import torch
 
-    torch.set_num_threads(1)
-    return make_batch(VEHICLE, count, backend="torch", device=device, compile=True)
+    torch.set_num_threads(available_cores())
+    return make_batch(VEHICLE, count, backend="torch", device=device)
 
 
 @contextmanager
 def vehicles_torch(effort: Effort) -> Iterator[Sides]:
-    """Batched vehicles in torch, one thread, against the same in NumPy."""
+    """Batched vehicles in torch, on all cores, against the same in NumPy, which uses one."""
     count = effort.size(100_000, 10)
     env, peer = make_torch_vehicles(count, "cpu"), make_batch(VEHICLE, count)
     ours, theirs = steps_together(env, VEHICLE, "cpu"), steps_together(peer, VEHICLE)
-    yield paced(ours, theirs, effort)
+    yield replace(paced(ours, theirs, effort), note=lambda: f"torch on {available_cores()} threads")
     env.close()
     peer.close()
 
@@ -179,7 +182,8 @@ def step_bytes(env: VectorEnv, device: str) -> float:
 
     action = torch.as_tensor(env.action_space.sample(), device=device)
     answers = env.step(action)
-    state = tensor_bytes(vars(env.unwrapped.world))
+    unwrapped: Any = env.unwrapped
+    state = tensor_bytes(vars(unwrapped.world))
     return (2 * state + tensor_bytes(action) + tensor_bytes(answers)) / env.num_envs
 
 
@@ -203,8 +207,6 @@ def tensor_bytes(tree: Any) -> int:
 
 def copy_bandwidth(device: str, size: int = 1 << 30, copies: int = 10) -> float:
     """Bytes read and written per second where one large tensor is copied to another."""
-    import time
-
     import torch
 
     source = torch.zeros(size, dtype=torch.uint8, device=device)

@@ -174,6 +174,12 @@ def not_measured(row: Row, why: str) -> Result:
     return Result(row.name, None, row.unit, row.peer, target=target, note=f"not measured: {why}")
 
 
+def reason(error: Exception) -> str:
+    """One line that says what went wrong."""
+    lines = str(error).strip().splitlines()
+    return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
+
+
 def rate(work: Callable[[], int], seconds: float) -> float:
     """How many pieces per second ``work`` does, which says at each call how many it did."""
     pieces, started = 0, time.perf_counter()

@@ -19,7 +19,6 @@ def at_most(bound: float) -> Target:
 
 
 _REACH, _PPO, _BARE = "PandaReach-v3", "SB3's PPO.predict", "forward + backward"
-_ONCE = {"repeats": 1, "warm_up": False}
 
 # fmt: off
 _ROWS = (
@@ -37,11 +36,12 @@ _ROWS = (
     Row("workers", "Panda evaluation, 2 workers", "episodes/s", "1 worker", at_least(1.8),
         processes.workers, repeats=3, warm_up=False),
     Row("import", "`import rise_envs`", "s", "import gymnasium", at_most(1.3), processes.imports, 15),
-    Row("memory", "Memory of a vehicle", "bytes", "", at_most(400), envs.memory, **_ONCE),
+    Row("memory", "Memory of a vehicle", "bytes", "", at_most(400), envs.memory,
+        repeats=1, warm_up=False),
     Row("bench", "`make bench`, nothing done", "s", "", at_most(480),
-        partial(processes.bench, cold=True), by_default=False, **_ONCE),
+        partial(processes.bench, cold=True), repeats=1, warm_up=False, by_default=False),
     Row("bench-again", "`make bench`, all done", "s", "", at_most(15),
-        partial(processes.bench, cold=False), by_default=False, **_ONCE),
+        partial(processes.bench, cold=False), repeats=1, warm_up=False, by_default=False),
 )
 # fmt: on
 ROWS = {row.name: row for row in _ROWS}

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from gymnasium import Env
@@ -18,7 +19,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from benchmarks.plots import FAINT, GRID, INK
 from benchmarks.results import atomic_write_text
 from benchmarks.speed import envs
-from benchmarks.speed.measure import Effort, rate
+from benchmarks.speed.measure import Effort, rate, reason
 
 SIZES = (1, 10, 100, 1_000, 10_000, 100_000)
 
@@ -120,12 +121,6 @@ def _opened(size: int, failed: dict[str, str]) -> Iterator[dict[str, envs.Work]]
             env.close()
 
 
-def reason(error: Exception) -> str:
-    """One line that says what went wrong."""
-    lines = str(error).strip().splitlines()
-    return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
-
-
 def write_points(path: Path, points: Sequence[Point]) -> None:
     """Write ``throughput.csv``."""
     sink = io.StringIO()
@@ -159,7 +154,7 @@ def figure(points: Sequence[Point]) -> Figure:
         0.015, 1 - 0.14 / height, "Throughput against the size of the batch",
         va="top", size=14.5, weight="bold", color=INK,
     )  # fmt: skip
-    note = "One core  ·  random actions, resets included  ·  median of 3, shaded: quartiles"
+    note = "Random actions, resets included  ·  one core, torch all  ·  median of 3, shaded: quartiles"
     drawn.text(0.015, 1 - 0.45 / height, note, va="top", size=10.5, color=FAINT)
     axis = drawn.subplots()
     batches = sorted({point.batch for point in points})
@@ -168,9 +163,10 @@ def figure(points: Sequence[Point]) -> Figure:
         series = SERIES[name]
         own = sorted((point for point in points if point.series == name), key=lambda point: point.batch)
         x, y = [point.batch for point in own], [point.steps_per_second for point in own]
-        style = {"color": series.colour, "linewidth": 1.9, "linestyle": "--" if series.peer else "-"}
+        style: dict[str, Any] = {"color": series.colour, "linewidth": 1.9}
+        style["linestyle"] = ":" if series.largest == 1 else "--" if series.peer else "-"
         if series.largest == 1:
-            axis.axhline(y[0], **{**style, "linestyle": ":"})
+            axis.axhline(y[0], **style)
         else:
             axis.fill_between(
                 x, [p.low for p in own], [p.high for p in own], color=series.colour, alpha=0.16, linewidth=0

@@ -9,6 +9,7 @@ import importlib
 from typing import Any
 
 from rise_agents.agent import nearest
+from rise_envs import STAND_INS
 from rise_envs.task import task_of
 
 EXPERTS: dict[tuple[str, str], str] = {
@@ -19,7 +20,7 @@ EXPERTS: dict[tuple[str, str], str] = {
     ("RISE-SafePanda-v0", "mpc"): "rise_agents.experts.panda_mpc:PandaMPC",
     ("RISE-SafePanda-v0", "mixture"): "rise_agents.experts.mixture:Mixture",
 }
-"""(environment id, expert's name) → ``module:Class``."""
+"""(environment id, expert's name) → ``module:Class``. An environment's stand-in has the same experts."""
 
 
 def expert_names(env_id: str) -> tuple[str, ...]:
@@ -28,7 +29,7 @@ def expert_names(env_id: str) -> tuple[str, ...]:
     Raises:
         ValueError: there are none; the message names the nearest environment that has some.
     """
-    names = tuple(name for env, name in EXPERTS if env == env_id)
+    names = tuple(name for env, name in EXPERTS if env == STAND_INS.get(env_id, env_id))
     if not names:
         known = sorted({env for env, _ in EXPERTS})
         raise ValueError(f"no expert for environment {env_id!r}; {nearest(env_id, known)}")
@@ -50,7 +51,7 @@ def make_expert(name: str, env_id: str, seed: int = 0, **kwargs: Any) -> Any:
     names = expert_names(env_id)
     if name not in names:
         raise ValueError(f"no expert {name!r} for {env_id}; {nearest(name, names)}")
-    module, _, cls = EXPERTS[env_id, name].partition(":")
+    module, _, cls = EXPERTS[STAND_INS.get(env_id, env_id), name].partition(":")
     kind = getattr(importlib.import_module(module), cls)
     # A mixture lists the experts that it draws from.
     experts = [make_expert(member, env_id, seed, **kwargs) for member in getattr(kind, "names", ())]
