@@ -12,6 +12,8 @@ import pytest
 import torch
 from gymnasium.vector import AutoresetMode
 
+from rise_agents import AGENTS, make_agent
+from rise_agents.demonstrations import generate
 from rise_envs import shared
 from rise_envs.noise import NOISE_MODELS
 from rise_envs.noise_wrappers import VectorObservationNoise
@@ -161,12 +163,12 @@ def test_noise_on_tensors_is_that_on_arrays(noise: str, mode: AutoresetMode) -> 
             out_a, out_b = (env.reset(options={"reset_mask": ended}) for env in (a, b))
 
 
-def test_agents_act_on_tensors_as_on_arrays() -> None:
-    from rise_agents import make_agent
-    from rise_agents.demonstrations import generate
-
-    brief = {"updates": 3, "vae_updates": 3}
-    agent = make_agent("rise", ID, brief).learn(generate(ID, "cbf", 3))
+@pytest.mark.parametrize("name", AGENTS)
+def test_agents_act_on_tensors_as_on_arrays(name: str) -> None:
+    brief = {"cppo": {"total_steps": 64, "n_envs": 4, "n_steps": 8, "batch_size": 32}}
+    brief |= {"rise": {"updates": 3, "vae_updates": 3}, "pcbc": {"updates": 3}}
+    agent = make_agent(name, ID, brief[name])
+    agent.learn(generate(ID, "cbf", 3) if agent.learns_from == "demonstrations" else None)
     seen, tensors = (make(**kwargs).reset(seed=1)[0] for kwargs in ({}, {"backend": "torch"}))
     np.testing.assert_array_equal(
         agent.predict(tensors, deterministic=True)[0], agent.predict(seen, deterministic=True)[0]
