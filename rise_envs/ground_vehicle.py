@@ -10,8 +10,9 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from rise_envs import goals, streams
+from rise_envs import goals
 from rise_envs.actions import finite_action
+from rise_envs.episodes import EpisodeStreams
 from rise_envs.task import Task
 from rise_envs.vehicle_world import Array, Params, World, sample_starts
 
@@ -174,8 +175,8 @@ class GroundVehicleEnv(VehicleTask, gym.Env):
         from rise_envs import vehicle_compiled  # numba is loaded by those who drive only
 
         self._dynamics, self._numbers = vehicle_compiled, vehicle_compiled.packed(self.constants)
-        self._base: NDArray[np.int64] | None = None  # of this environment's stream of episodes
-        self._episode = self._key = self._time = 0
+        self._streams = EpisodeStreams(1)
+        self._key = self._time = 0
         self._now: Array | None = None  # x, y, θ, goal, and the reading of each disc
         self._trail: list[Array] = []
         self._window: Any = None
@@ -207,15 +208,9 @@ class GroundVehicleEnv(VehicleTask, gym.Env):
     ) -> tuple[dict[str, Array], dict[str, Any]]:
         """Start an episode; with ``seed`` the one that this seed names."""
         super().reset(seed=seed)
-        if seed is not None:
-            self._base, self._episode = streams.seed_bases([seed]), 0
-        elif self._base is None:
-            self._base = streams.seed_bases([int(self.np_random.integers(2**63))])
-        number = np.array([self._episode])
-        world, (clearance,) = sample_starts(
-            self._base, number, self.n_obstacles, self.constants, self._dynamics
-        )
-        self._episode += 1
+        self._streams.seed(seed, rng=self.np_random)
+        base, number = self._streams.next(np.array([0]))
+        world, (clearance,) = sample_starts(base, number, self.n_obstacles, self.constants, self._dynamics)
         self.world, self.perceived = world, None
         self._trail = [world.state[0, :2]]
         shown = np.concatenate((world.state[0], world.state[0, :2], self._started()[3:], world.state[0, :2]))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, cast
 
 import gymnasium as gym
@@ -12,8 +11,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from rise_envs import streams
 from rise_envs.arithmetic import to_float
+from rise_envs.episodes import EpisodeStreams, Seeds, check_running, reset_mask
 from rise_envs.ground_vehicle import DEFAULTS, VehicleTask, make_spaces
 from rise_envs.vehicle_backend import choose
 from rise_envs.vehicle_world import Outcome, Params, World, copied, sample_starts
@@ -77,8 +76,7 @@ class GroundVehicleVectorEnv(VehicleTask, VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = cast(spaces.Box, batch_space(self.single_action_space, num_envs))
         self._backend = choose(backend, device, compiled)
-        self._base: Array = None  # of each sub-environment's stream of episodes
-        self._episode = self._backend.own(np.zeros(num_envs, np.int64))
+        self._streams = EpisodeStreams(num_envs, self._backend.own)
         self._done = self._backend.own(np.zeros(num_envs, bool))
 
     @property
@@ -93,7 +91,7 @@ class GroundVehicleVectorEnv(VehicleTask, VectorEnv):
         return self._world
 
     def reset(
-        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+        self, *, seed: Seeds = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Array], Infos]:
         """Start all episodes, or those of ``options["reset_mask"]`` (B,) bool.
 
@@ -101,36 +99,20 @@ class GroundVehicleVectorEnv(VehicleTask, VectorEnv):
             ValueError: seeds or a mask whose length is not ``num_envs``, or seeds that are no whole numbers ≥ 0.
             gymnasium.error.ResetNeeded: a mask in the first reset, which must start all.
         """
-        mask = (options or {}).get("reset_mask", np.ones(self.num_envs, bool))
-        mask = np.asarray(mask.cpu() if hasattr(mask, "cpu") else mask)
-        if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
-            raise ValueError(f"options['reset_mask'] must be ({self.num_envs},) bool with at least one True")
-        if self._world is None and not mask.all():
-            raise gym.error.ResetNeeded("the first reset() must start every sub-environment")
-        self._seed(seed, mask)
+        mask = reset_mask(options, self.num_envs, first=self._world is None)
+        self._streams.seed(seed, mask)
         rows = self._backend.own(np.flatnonzero(mask))
         clearance = self._start(rows)
         shown = self._fresh(rows, clearance)
         infos = self._infos(shown)
         return self._observation(shown), infos | self._masks(infos, mask)
 
-    def _seed(self, seed: int | Sequence[int | None] | None, mask: NDArray[np.bool_]) -> None:
-        """Begin the streams of episodes anew where the mask and a seed say so."""
-        own, n = self._backend.own, self.num_envs
-        seeds = _each(seed, n)
-        named = np.full(n, True) if isinstance(seeds, range) else np.array([s is not None for s in seeds])
-        rows = np.flatnonzero(named & mask)
-        bases = streams.seed_bases(seeds if len(rows) == n else [seeds[i] for i in rows.tolist()])
-        if self._base is None:  # those who name none begin anywhere
-            self._base = own(np.random.SeedSequence().generate_state(n, np.uint64).view(np.int64))
-        self._base[own(rows)], self._episode[own(rows)] = own(bases), 0
-
     def _start(self, rows: Array) -> Array:
         """Start the next episodes of ``rows`` (indices): their clearances."""
+        base, number = self._streams.next(rows)
         fresh, clearance = sample_starts(
-            self._base[rows], self._episode[rows], self.n_obstacles, self.constants, self._backend.dynamics
+            base, number, self.n_obstacles, self.constants, self._backend.dynamics
         )
-        self._episode[rows] += 1
         if len(rows) == self.num_envs:
             self._world = fresh
         else:
@@ -180,12 +162,8 @@ class GroundVehicleVectorEnv(VehicleTask, VectorEnv):
         world, backend = self.world, self._backend
         action = backend.action(actions, self.action_space.shape)
         restart = bool(self._done.any())
-        if restart and self.autoreset_mode == AutoresetMode.DISABLED:
-            which = [i for i, over in enumerate(self._done.tolist()) if over]
-            raise gym.error.ResetNeeded(
-                f"sub-environments {which} have ended: reset them with "
-                "options={'reset_mask': mask} before the next step"
-            )
+        if self.autoreset_mode == AutoresetMode.DISABLED:
+            check_running(self._done)
         shown = backend.dynamics.advance(
             world,
             action,
@@ -254,13 +232,3 @@ class GroundVehicleVectorEnv(VehicleTask, VectorEnv):
 def _indices(mask: Array) -> Array:
     """Where a mask of NumPy or torch holds."""
     return mask.nonzero()[0] if isinstance(mask, np.ndarray) else mask.nonzero()[:, 0]
-
-
-def _each(seed: int | Sequence[int | None] | None, n: int) -> Sequence[Any]:
-    """A seed, or None, for each of ``n`` sub-environments, as Gymnasium shares them out."""
-    if isinstance(seed, int | np.integer):
-        return range(int(seed), int(seed) + n)
-    seeds = [None] * n if seed is None else seed
-    if len(seeds) != n:
-        raise ValueError(f"expected {n} seeds, got {len(seeds)}")
-    return seeds
