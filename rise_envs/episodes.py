@@ -7,6 +7,8 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
+from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from rise_envs import streams
@@ -65,6 +67,19 @@ def _each(seed: Seeds, count: int) -> Sequence[Any]:
     if len(seeds) != count:
         raise ValueError(f"expected {count} seeds, got {len(seeds)}")
     return seeds
+
+
+def space_of_many(space: spaces.Space, count: int) -> Any:
+    """Gymnasium's ``batch_space`` of a Box or a Dict of Boxes, the bounds of one row standing for those of all.
+
+    For a hundred thousand vehicles the bounds would take as much memory as all the rest.
+    """
+    many = batch_space(space, count)
+    for box in many.values() if isinstance(many, spaces.Dict) else (many,):
+        for name in ("low", "high", "bounded_below", "bounded_above"):
+            bounds = getattr(box, name)
+            setattr(box, name, np.broadcast_to(bounds[:1].copy(), bounds.shape))
+    return many
 
 
 def reset_mask(options: dict[str, Any] | None, count: int, first: bool) -> NDArray[np.bool_]:

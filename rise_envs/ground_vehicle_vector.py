@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any, cast
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
-from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from rise_envs.arithmetic import to_float
-from rise_envs.episodes import EpisodeStreams, Seeds, check_running, reset_mask
+from rise_envs.episodes import EpisodeStreams, Seeds, check_running, reset_mask, space_of_many
 from rise_envs.ground_vehicle import DEFAULTS, VehicleTask, make_spaces
 from rise_envs.vehicle_backend import choose
 from rise_envs.vehicle_world import Outcome, Params, World, copied, sample_starts
@@ -73,8 +72,8 @@ class GroundVehicleVectorEnv(VehicleTask, VectorEnv):
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         self.single_observation_space, self.single_action_space = make_spaces(self.n_obstacles, params)
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = cast(spaces.Box, batch_space(self.single_action_space, num_envs))
+        self.observation_space = space_of_many(self.single_observation_space, num_envs)
+        self.action_space = space_of_many(self.single_action_space, num_envs)
         self._backend = choose(backend, device, compiled)
         self._streams = EpisodeStreams(num_envs, self._backend.own)
         self._done = self._backend.own(np.zeros(num_envs, bool))

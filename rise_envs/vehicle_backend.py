@@ -69,18 +69,21 @@ def _with_torch(dynamics: Any, device: str, compiled: bool) -> Backend:
         reason = str(error).splitlines()[0]
         raise ValueError(f"torch cannot use device {device!r}: {reason}") from None
 
-    def action(values: Any, shape: tuple[int, ...]) -> Any:
-        if not isinstance(values, torch.Tensor):
-            values = torch.from_numpy(finite_action(values, shape))
-        elif values.shape != shape or values.dtype.is_complex:
-            given = f"shape {tuple(values.shape)} and {values.dtype}"
-            raise ValueError(f"action must be real numbers of shape {shape}, got {given}")
-        elif not bool(torch.isfinite(values).all()):
+    def on_host(values: Any, shape: tuple[int, ...]) -> Any:
+        # NumPy's operations, as torch's wake all of its threads: on a busy machine these wait for each other.
+        if isinstance(values, torch.Tensor):
+            values = values.detach().cpu()
+            values = (values.float() if values.dtype == torch.bfloat16 else values).numpy()
+        return finite_action(values, shape)
+
+    def on_device(values: Any, shape: tuple[int, ...]) -> Any:
+        if not isinstance(values, torch.Tensor) or values.shape != shape or values.is_complex():
+            return torch.as_tensor(on_host(values, shape), device=place)
+        if not bool(torch.isfinite(values).all()):
             where = torch.nonzero(~torch.isfinite(values))[0].tolist()
             raise ValueError(f"action must be finite, got {values[tuple(where)].item()} at index {where}")
-        return values.detach().to(place, torch.float64).contiguous()
+        return values.detach().to(place, torch.float64)
 
     if compiled:  # tensors and arrays share their memory on the CPU
-        threads = torch.get_num_threads()
-        return Backend(dynamics, _same, torch.from_numpy, lambda a, shape: action(a, shape).numpy(), threads)
-    return Backend(dynamics, lambda array: torch.as_tensor(np.asarray(array), device=place), _same, action)
+        return Backend(dynamics, _same, torch.from_numpy, on_host, torch.get_num_threads())
+    return Backend(dynamics, lambda array: torch.as_tensor(np.asarray(array), device=place), _same, on_device)

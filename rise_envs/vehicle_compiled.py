@@ -37,6 +37,7 @@ Whole = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
 LANES = 16
+_row = np.uintp  # a row's number as the compiler likes it: one that cannot count from the end
 _X, _Y, _THETA, _V, _OMEGA, _GX, _GY, _PX, _PY, _VX, _VY, _RADIUS, _LEAST = range(13)
 
 
@@ -126,7 +127,7 @@ def _pass_discs(
     n_count, keys, counters = disc.shape[1], np.empty(LANES, np.int64), np.empty(LANES, np.int64)
     for n in range(n_count):
         for m in range(LANES):
-            b = start + min(m, count - 1)
+            b = _row(start + min(m, count - 1))
             w[_PX, m], w[_PY, m], w[_RADIUS, m] = disc[b, n, 0], disc[b, n, 1], disc[b, n, 4]
             w[_VX, m], w[_VY, m] = disc[b, n, 2], disc[b, n, 3]
             keys[m], counters[m] = key[b], DRAWS * ((time[b] + 1) * n_count + n)
@@ -142,11 +143,11 @@ def _pass_discs(
             u, v, _ = next_velocity(place, (u, v, 0.0), w[_RADIUS, m], there, keys[m], counters[m], c.rules)
             w[_PX, m], w[_PY, m], w[_VX, m], w[_VY, m] = px, py, u, v
         for m in range(count):
-            b, d = start + m, 5 * n
+            b = _row(start + m)
             px, py, u, v, radius = w[_PX, m], w[_PY, m], w[_VX, m], w[_VY, m], w[_RADIUS, m]
             disc[b, n, 0], disc[b, n, 1], disc[b, n, 2], disc[b, n, 3] = px, py, u, v
-            obstacle[b, d], obstacle[b, d + 1], obstacle[b, d + 2], obstacle[b, d + 3] = px, py, u, v
-            obstacle[b, d + 4] = radius
+            obstacle[b, n, 0], obstacle[b, n, 1], obstacle[b, n, 2], obstacle[b, n, 3] = px, py, u, v
+            obstacle[b, n, 4] = radius
 
 
 @compiled
@@ -179,7 +180,7 @@ def _advance(
     for start in range(first, last, LANES):
         count = min(LANES, last - start)
         for m in range(LANES):
-            b = start + min(m, count - 1)
+            b = _row(start + min(m, count - 1))
             w[_X, m], w[_Y, m], w[_THETA, m] = state[b, 0], state[b, 1], state[b, 2]
             w[_GX, m], w[_GY, m], w[_LEAST, m] = goal[b, 0], goal[b, 1], np.inf
             w[_V, m], w[_OMEGA, m] = action[b, 0], action[b, 1]
@@ -188,7 +189,7 @@ def _advance(
             w[_OMEGA, m] = clipped(w[_OMEGA, m], -c.omega_max, c.omega_max)
         _pass_discs(start, count, w, disc, key, time, obstacle, c)
         for m in range(count):
-            b = start + m
+            b = _row(start + m)
             previous[b, 0], previous[b, 1] = w[_X, m], w[_Y, m]
         for m in range(LANES):
             x, y, theta, gx, gy = w[_X, m], w[_Y, m], w[_THETA, m], w[_GX, m], w[_GY, m]
@@ -199,7 +200,7 @@ def _advance(
             w[_X, m], w[_Y, m], w[_THETA, m] = x, y, theta
             w[_V, m], w[_OMEGA, m] = reward(before, after, arrived, c), to_float(arrived)
         for m in range(count):
-            b = start + m
+            b = _row(start + m)
             x, y, theta, least, arrived = w[_X, m], w[_Y, m], w[_THETA, m], w[_LEAST, m], w[_OMEGA, m] > 0.0
             state[b, 0], state[b, 1], state[b, 2] = x, y, theta
             seen[b, 0], seen[b, 1], seen[b, 2] = x, y, theta
@@ -229,8 +230,8 @@ def advance(
     parts = [np.empty((b_count, width)) for width in widths] + [np.empty(b_count) for _ in range(3)]
     shown = Outcome(*parts, *(np.empty(b_count, np.bool_) for _ in range(3)))
     arguments = (
-        *(world.state, world.goal, world.disc, world.key, world.step),
-        *(action, packed(c), limit, on_collision, *shown),
+        *(world.state, world.goal, world.disc, world.key, world.step, action, packed(c), limit, on_collision),
+        *(*shown[:3], shown.obstacle.reshape(world.disc.shape), *shown[4:]),
     )
     shared.run(lambda first, last: _advance(first, last, *arguments), b_count, LANES, threads)
     return shown

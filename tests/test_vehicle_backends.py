@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
 
 from rise_agents import AGENTS, make_agent
 from rise_agents.demonstrations import generate
@@ -112,21 +113,22 @@ def test_torch_hands_out_tensors_only_and_nothing_twice(compiled: bool) -> None:
             array[...] = 77
 
 
-def test_torch_takes_arrays_and_tensors_and_refuses_bad_ones() -> None:
-    env = make(3, backend="torch")
+@pytest.mark.parametrize("compiled", [True, False])
+def test_torch_takes_arrays_and_tensors_and_refuses_bad_ones(compiled: bool) -> None:
+    env = make(3, backend="torch", compiled=compiled)
     env.reset(seed=0)
     before = env.unwrapped.world.copy()
     for action, message in (
         (torch.zeros(2, 2), "shape"),
         (torch.full((3, 2), torch.nan), "finite"),
-        (torch.zeros((3, 2), dtype=torch.complex64), "real"),
+        (torch.zeros((3, 2), dtype=torch.complex64), "numeric"),
         (np.full((3, 2), np.inf), "finite"),
     ):
         with pytest.raises(ValueError, match=message):
             env.step(action)
     for name, value in vars(before).items():
         np.testing.assert_array_equal(getattr(env.unwrapped.world, name), value)
-    env.step(np.zeros((3, 2))), env.step(torch.zeros(3, 2, dtype=torch.float16))
+    env.step(np.zeros((3, 2))), env.step(torch.zeros(3, 2, dtype=torch.bfloat16))
 
 
 def test_unknown_backends_and_devices_are_named() -> None:
@@ -173,6 +175,18 @@ def test_agents_act_on_tensors_as_on_arrays(name: str) -> None:
     np.testing.assert_array_equal(
         agent.predict(tensors, deterministic=True)[0], agent.predict(seen, deterministic=True)[0]
     )
+
+
+def test_the_spaces_hold_one_rows_bounds_only() -> None:
+    env = make(1_000)
+    for space, single in (
+        (env.observation_space, env.single_observation_space),
+        (env.action_space, env.single_action_space),
+    ):
+        assert space == batch_space(single, 1_000)
+        assert space.contains(space.sample())
+    boxes = [*env.observation_space.values(), env.action_space]
+    assert all(box.low.strides[0] == box.high.strides[0] == 0 for box in boxes)
 
 
 # --- threads ----------------------------------------------------------------------------------------------
