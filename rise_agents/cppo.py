@@ -314,9 +314,10 @@ class CPPO:
         if self._actor is None:
             raise RuntimeError("this C-PPO agent is untrained: call learn() or load a checkpoint first")
         parts = observation if isinstance(observation, dict) else {"": observation}
+        parts = {key: np.asarray(readings.on_host(part)) for key, part in parts.items()}
         single = all(np.ndim(parts[key]) == rank for key, rank in self._notes["ranks"].items())
         if single:
-            parts = {key: np.asarray(part)[None] for key, part in parts.items()}
+            parts = {key: part[None] for key, part in parts.items()}
         readings.check_finite(parts)
         output = self._actor.output(self._inputs(parts))
         if not deterministic:

@@ -33,11 +33,16 @@ FRAMES = ("world", "body", "features")
 def as_batch(observation: Mapping[str, Any]) -> tuple[dict[str, Array], bool]:
     """The observation as float64 with a batch axis in front, and whether it came as a single one.
 
-    An observation is a batch if its ``desired_goal`` has two dimensions.
+    An observation is a batch if its ``desired_goal`` has two dimensions. Tensors of torch will do.
     """
-    rows = {name: np.asarray(value, np.float64) for name, value in observation.items()}
+    rows = {name: np.asarray(on_host(value), np.float64) for name, value in observation.items()}
     single = rows["desired_goal"].ndim == 1
     return ({name: value[None] for name, value in rows.items()} if single else rows), single
+
+
+def on_host(value: Any) -> Any:
+    """What NumPy can read: ``value`` itself, or a tensor brought from its device."""
+    return value.cpu() if hasattr(value, "cpu") else value
 
 
 def check_finite(parts: Mapping[str, NDArray]) -> None:

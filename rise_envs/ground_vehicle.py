@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import gymnasium as gym
@@ -9,10 +10,11 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from rise_envs import goals, streams
-from rise_envs.actions import checked_action
+from rise_envs import goals
+from rise_envs.actions import finite_action
+from rise_envs.episodes import EpisodeStreams
 from rise_envs.task import Task
-from rise_envs.vehicle_world import Array, Params, World, advance, observe, sample_starts, start_clearance
+from rise_envs.vehicle_world import Array, Params, World, sample_starts
 
 DEFAULTS = Params()
 
@@ -44,8 +46,6 @@ def make_spaces(n_obstacles: int, p: Params) -> tuple[spaces.Dict, spaces.Box]:
 class VehicleTask:
     """What the single and the batched environment share: arguments, state, goal API, description."""
 
-    _world: World | None = None
-
     def __init__(
         self, reward_type: str, terminate_on_collision: bool, n_obstacles: int, params: Params
     ) -> None:
@@ -54,17 +54,7 @@ class VehicleTask:
         self.reward_type = goals.check_reward_type(reward_type)
         self.terminate_on_collision = bool(terminate_on_collision)
         self.n_obstacles, self.params = int(n_obstacles), params
-
-    @property
-    def world(self) -> World:
-        """The true state, for drawing and tests: to be read, never to be written into.
-
-        Raises:
-            gymnasium.error.ResetNeeded: before the first reset.
-        """
-        if self._world is None:
-            raise gym.error.ResetNeeded("call reset() to start an episode")
-        return self._world
+        self.constants = params.constants(sparse=reward_type == "sparse")
 
     @staticmethod
     def task(n_obstacles: int = 1, params: Params | None = None, **_: Any) -> Task:
@@ -94,6 +84,15 @@ class VehicleTask:
     def compute_truncated(self, achieved_goal: Array, desired_goal: Array, info: Any) -> Any:
         """Never: the time limit truncates."""
         return np.zeros(np.shape(achieved_goal)[:-1], bool)[()]
+
+
+def _command(action: Any) -> list[float]:
+    """(v, ω) of an action; raises ``ValueError`` as :func:`rise_envs.actions.finite_action` does."""
+    if type(action) is np.ndarray and action.shape == (2,) and action.dtype.kind == "f":
+        values = action.tolist()
+        if math.isfinite(values[0]) and math.isfinite(values[1]):
+            return values
+    return finite_action(action, (2,)).tolist()
 
 
 class GroundVehicleEnv(VehicleTask, gym.Env):
@@ -173,21 +172,51 @@ class GroundVehicleEnv(VehicleTask, gym.Env):
         # The reading as a noise wrapper last handed it out. A window, which draws within the step, shows the
         # one that the step's action was based on.
         self.perceived: Array | None = None
+        from rise_envs import vehicle_compiled  # numba is loaded by those who drive only
+
+        self._dynamics, self._numbers = vehicle_compiled, vehicle_compiled.packed(self.constants)
+        self._streams = EpisodeStreams(1)
+        self._key = self._time = 0
+        self._now: Array | None = None  # x, y, θ, goal, and the reading of each disc
         self._trail: list[Array] = []
         self._window: Any = None
+
+    @property
+    def world(self) -> World:
+        """The true state as a batch of one episode (a copy); assign one to set up a scene of your own.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the first reset.
+        """
+        now = self._started()
+        disc = now[5:].reshape(1, self.n_obstacles, 5).copy()
+        key, time = np.array([self._key]), np.array([self._time])
+        return World(now[None, :3].copy(), now[None, 3:5].copy(), disc, key, time)
+
+    @world.setter
+    def world(self, world: World) -> None:
+        self._now = np.concatenate((world.state[0], world.goal[0], world.disc[0].ravel()))
+        self._key, self._time = int(world.key[0]), int(world.step[0])
+
+    def _started(self) -> Array:
+        if self._now is None:
+            raise gym.error.ResetNeeded("call reset() to start an episode")
+        return self._now
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Array], dict[str, Any]]:
         """Start an episode; with ``seed`` the one that this seed names."""
         super().reset(seed=seed)
-        keys = np.array([streams.draw_key(self.np_random)])
-        self._world, self.perceived = sample_starts(keys, self.n_obstacles, self.params), None
-        self._trail = [self.world.state[0, :2]]
-        info = self._info(start_clearance(self.world, self.params)[0], self.world.state[0, :2])
+        self._streams.seed(seed, rng=self.np_random)
+        base, number = self._streams.next(np.array([0]))
+        world, (clearance,) = sample_starts(base, number, self.n_obstacles, self.constants, self._dynamics)
+        self.world, self.perceived = world, None
+        self._trail = [world.state[0, :2]]
+        shown = np.concatenate((world.state[0], world.state[0, :2], self._started()[3:], world.state[0, :2]))
         if self.render_mode == "human":
             self.render()
-        return self._observe(), info
+        return self._observation(shown), self._info(shown, float(clearance), False)
 
     def step(self, action: Any) -> tuple[dict[str, Array], float, bool, bool, dict[str, Any]]:
         """Drive for one step.
@@ -196,28 +225,36 @@ class GroundVehicleEnv(VehicleTask, gym.Env):
             ValueError: an action of the wrong shape, or not finite. Nothing has moved then.
             gymnasium.error.ResetNeeded: before the first reset.
         """
-        before = self.world.state[0, :2]
-        driven = checked_action(action, self.action_space)
-        self._world, clearance = advance(self.world, driven[None], self.params)
-        self._trail.append(self.world.state[0, :2])
-        observation, info = self._observe(), self._info(clearance[0], before)
-        achieved, goal = observation["achieved_goal"], observation["desired_goal"]
-        reward = float(self.compute_reward(achieved, goal, info))
-        terminated = bool(self.compute_terminated(achieved, goal, info))
-        if self.render_mode == "human":
-            self.render()
-        return observation, reward, terminated, False, info
+        now, (v, omega) = self._started(), _command(action)
+        shown = np.empty(9 + 5 * self.n_obstacles)
+        clearance, reward, reached = self._dynamics.step_alone(
+            now, self._key, self._time, v, omega, self._numbers, shown
+        )
+        self._time += 1
+        terminated = reached or (self.terminate_on_collision and clearance < 0.0)
+        if self.render_mode is not None:
+            self._trail.append(now[:2].copy())
+            if self.render_mode == "human":
+                self.render()
+        return self._observation(shown), reward, terminated, False, self._info(shown, clearance, reached)
 
-    def _observe(self) -> dict[str, Array]:
-        return {key: rows[0] for key, rows in observe(self.world).items()}
-
-    def _info(self, clearance: float, before: Array) -> dict[str, Any]:
-        achieved, goal = self.world.state[0, :2], self.world.goal[0]
+    @staticmethod
+    def _observation(shown: Array) -> dict[str, Array]:
+        """The parts of ``shown``: views of an array that nobody else holds, none of which overlap."""
         return {
-            "cost": float(clearance < 0),
-            "clearance": float(clearance),
-            "is_success": bool(goals.distance(achieved, goal) <= self.params.goal_radius),
-            "previous_achieved_goal": before.copy(),
+            "observation": shown[:3],
+            "achieved_goal": shown[3:5],
+            "desired_goal": shown[5:7],
+            "obstacle": shown[7:-2],
+        }
+
+    @staticmethod
+    def _info(shown: Array, clearance: float, reached: bool) -> dict[str, Any]:
+        return {
+            "cost": 1.0 if clearance < 0.0 else 0.0,
+            "clearance": clearance,
+            "is_success": reached,
+            "previous_achieved_goal": shown[-2:],
         }
 
     def render(self) -> NDArray[np.uint8] | None:
@@ -234,7 +271,7 @@ class GroundVehicleEnv(VehicleTask, gym.Env):
             w.state[0],
             w.goal[0],
             self.n_obstacles,
-            observe(w)["obstacle"][0],
+            w.disc[0].ravel(),
             self.perceived,
             self._trail,
             self.params,

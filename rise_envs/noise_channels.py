@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from array_api_compat import array_namespace, is_torch_array
 from gymnasium import spaces
 from numpy.typing import ArrayLike
 
@@ -60,13 +61,17 @@ class Channels:
     def read(self, observation: Any, n: int = 1) -> Array:
         """The channels of ``n`` observations, (n, C), as an array of its own."""
         parts = [observation] if self.keys is None else [observation[key] for key in self.keys]
+        if is_torch_array(parts[0]):
+            xp = array_namespace(parts[0])
+            return xp.concat([xp.astype(part, xp.float64).reshape(n, -1) for part in parts], axis=1)
         rows = [np.array(part, dtype=np.float64).reshape(n, -1) for part in parts]
         return rows[0] if len(rows) == 1 else np.concatenate(rows, axis=1)
 
     def write(self, observation: Any, noisy: Array, batch: tuple[int, ...] = ()) -> Any:
         """The observation (or the batch of them, of shape ``batch``) with its channels replaced."""
+        xp = array_namespace(noisy)
         fresh = [
-            noisy[:, span].reshape(batch + box.shape).astype(box.dtype)
+            xp.astype(noisy[:, span].reshape(batch + box.shape), getattr(xp, box.dtype.name))
             for box, span in zip(self.boxes, self.spans, strict=True)
         ]
         return fresh[0] if self.keys is None else {**observation, **dict(zip(self.keys, fresh, strict=True))}
@@ -118,10 +123,20 @@ def _scale(value: Any, box: spaces.Box, name: str) -> Array:
     return scale
 
 
+def placed(array: Any, like: Any) -> Any:
+    """An array of NumPy where ``like`` is, if that is a tensor of torch; keys (uint64) keep their bits."""
+    if not is_torch_array(like) or is_torch_array(array):
+        return array
+    array = array.view(np.int64) if array.dtype == np.uint64 else array
+    return array_namespace(like).asarray(array.copy(), device=like.device)
+
+
 def own_copy(observation: Any) -> Any:
     """A copy that shares nothing with what the environment keeps."""
     if isinstance(observation, np.ndarray):
         return observation.copy()
+    if is_torch_array(observation):
+        return observation.clone()
     if isinstance(observation, dict):
         return {key: own_copy(value) for key, value in observation.items()}
     return copy.deepcopy(observation)

@@ -9,13 +9,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from array_api_compat import array_namespace, device
 
 from rise_envs import streams
 
-Array = NDArray[np.float64]
-Keys = NDArray[np.uint64]
-Steps = NDArray[np.int64]
+# Arrays of NumPy, or tensors on any device of torch; the arguments of a call are all of one library.
+Array = Any  # float64
+Keys = Any  # uint64, int64 with torch
+Steps = Any  # int64
 State = tuple[Any, ...]  # what a model carries: a (nested) tuple of arrays, each with the batch first
 Noisy = tuple[Array, State]
 
@@ -70,18 +71,31 @@ def require(name: str, value: Any, low: float = 0.0, high: float = math.inf) -> 
 # Draws for the coming steps wait in the state as a block (B, ahead, C): an episode on its own then pays for
 # the array operations of a draw only once in `ahead` steps.
 def _draw_state(keys: Keys, channels: int, ahead: int) -> State:
-    return keys, np.zeros((len(keys), ahead, channels))
+    return keys, _zeros(keys, ahead, channels)
+
+
+def _zeros(keys: Keys, *shape: int) -> Array:
+    """Zeros, one of the given shape for each key, where the keys are."""
+    xp = array_namespace(keys)
+    return xp.zeros((len(keys), *shape), dtype=xp.float64, device=device(keys))
+
+
+def _count(numbers: Array, n: int) -> Array:
+    """0 to n − 1, where ``numbers`` are."""
+    xp = array_namespace(numbers)
+    return xp.arange(n, dtype=xp.int64, device=device(numbers))
 
 
 def _draws(law: Callable[..., Array], step: Steps, state: State) -> Noisy:
     """Draws (B, C) of ``law`` (``streams.normal`` or ``streams.uniform``) for this step."""
     keys, block = state
     _, ahead, channels = block.shape
+    if ahead == 1:
+        return law(keys[:, None], step[:, None] * channels + _count(step, channels)), state
     phase = step % ahead
     due = phase == 0
     if due.any():
-        first = step[due, None].astype(np.uint64) * np.uint64(channels)
-        counter = first + np.arange(ahead * channels, dtype=np.uint64)  # step · C + channel
+        counter = step[due, None] * channels + _count(step, ahead * channels)  # step · C + channel
         fresh = law(keys[due, None], counter).reshape(-1, ahead, channels)
         if len(fresh) < len(block):
             block = block.copy()
@@ -137,7 +151,7 @@ class EpisodeBias(NoiseModel):
 
     def reset(self, keys: Keys, channels: int, ahead: int = 1) -> State:
         """The bias, (B, C), in units of its deviation."""
-        return (streams.normal(keys[:, None], np.arange(channels)),)
+        return (streams.normal(keys[:, None], _count(keys, channels)),)
 
     def __call__(self, reading: Array, scale: Array, step: Steps, state: State) -> Noisy:
         """The reading with the episode's error."""
@@ -163,7 +177,7 @@ class Drift(NoiseModel):
 
     def reset(self, keys: Keys, channels: int, ahead: int = 1) -> State:
         """The walk so far, (B, C), in units of its rate; the draws."""
-        return np.zeros((len(keys), channels)), _draw_state(keys, channels, ahead)
+        return _zeros(keys, channels), _draw_state(keys, channels, ahead)
 
     def __call__(self, reading: Array, scale: Array, step: Steps, state: State) -> Noisy:
         """The reading with the error that has grown so far."""
@@ -192,14 +206,14 @@ class Dropout(NoiseModel):
 
     def reset(self, keys: Keys, channels: int, ahead: int = 1) -> State:
         """The reading held, (B, C); the draws, one a step."""
-        return np.zeros((len(keys), channels)), _draw_state(keys, 1, ahead)
+        return _zeros(keys, channels), _draw_state(keys, 1, ahead)
 
     def __call__(self, reading: Array, scale: Array, step: Steps, state: State) -> Noisy:
         """The last reading that arrived."""
         held, draw_state = state
         chance, draw_state = _draws(streams.uniform, step, draw_state)
         lost = (chance < self.probability) & (step > 0)[:, None]
-        held = np.where(lost, held, reading)
+        held = array_namespace(reading).where(lost, held, reading)
         return held, (held, draw_state)
 
 
@@ -224,12 +238,13 @@ class Delay(NoiseModel):
 
     def reset(self, keys: Keys, channels: int, ahead: int = 1) -> State:
         """The readings on their way, (B, steps, C), oldest first."""
-        return (np.zeros((len(keys), int(self.steps), channels)),)
+        return (_zeros(keys, int(self.steps), channels),)
 
     def __call__(self, reading: Array, scale: Array, step: Steps, state: State) -> Noisy:
         """The oldest reading on its way."""
-        late = np.where((step == 0)[:, None, None], reading[:, None], state[0])
-        late = np.concatenate((late, reading[:, None]), axis=1)
+        xp = array_namespace(reading)
+        late = xp.where((step == 0)[:, None, None], reading[:, None], state[0])
+        late = xp.concat((late, reading[:, None]), axis=1)
         return late[:, 0], (late[:, 1:],)
 
 
@@ -256,8 +271,9 @@ class Quantise(NoiseModel):
 
     def __call__(self, reading: Array, scale: Array, step: Steps, state: State) -> Noisy:
         """The nearest point of the grid."""
-        grid = self.pitch * scale
-        return np.where(grid > 0, np.rint(reading / np.where(grid > 0, grid, 1.0)) * grid, reading), state
+        xp, grid = array_namespace(reading), self.pitch * scale
+        rounded = xp.round(reading / xp.where(grid > 0, grid, 1.0)) * grid
+        return xp.where(grid > 0, rounded, reading), state
 
 
 @dataclass(frozen=True)

@@ -23,14 +23,13 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
-from numpy.typing import NDArray
 
 from rise_envs import streams
 from rise_envs.noise import make_noise
-from rise_envs.noise_channels import Channels, Scale, own_copy
-from rise_envs.noise_models import Array, Keys, NoiseModel, State
+from rise_envs.noise_channels import Channels, Scale, own_copy, placed
+from rise_envs.noise_models import Array, Keys, NoiseModel, State, Steps
 
-Rows = NDArray[np.bool_]
+Rows = Any  # a mask (B,), of the library of the readings
 
 # Tags of key streams: they keep apart the noise of reset(seed=n), that of the noise seed n, and the
 # environment with seed n. Not 0: to NumPy the entropy (n, 0) is the same as n.
@@ -42,14 +41,15 @@ class NoiseRows:
 
     def __init__(self, model: NoiseModel, scale: Array, n: int, ahead: int) -> None:
         self.model, self.scale, self._ahead = model, scale, ahead
-        self._stream = np.random.SeedSequence().generate_state(n, np.uint64)
-        self._episode = np.zeros(n, dtype=np.uint64)
-        self._step = np.zeros(n, dtype=np.int64)
+        self._stream: Keys = np.random.SeedSequence().generate_state(n, np.uint64)
+        self._episode: Keys = np.zeros(n, dtype=np.uint64)
+        self._step: Steps = np.zeros(n, dtype=np.int64)
         self._state: State | None = None
 
-    def seed(self, row: int, seed: int) -> None:
-        """Let the stream of one row begin anew, as ``seed`` names it."""
-        self._stream[row], self._episode[row] = streams.key_from_seed(seed, _STREAM), 0
+    def seed(self, rows: Rows, seeds: Sequence[int]) -> None:
+        """Let the streams of the given rows (B,) begin anew, as ``seeds`` (one for each) name them."""
+        self._stream[rows] = placed(streams.seed_keys(seeds, _STREAM), self._stream)
+        self._episode[rows] = 0
 
     def start(self, reading: Array, rows: Rows, noise_seeds: Sequence[int] | None = None) -> Array:
         """Begin episodes in the given rows (B,): their first noisy readings, (rows.sum(), C).
@@ -59,18 +59,22 @@ class NoiseRows:
             rows: which rows, (B,).
             noise_seeds: B seeds that name the noise of these episodes, instead of the rows' own streams.
         """
-        if self._state is None and not rows.all():
-            raise gym.error.ResetNeeded("the first reset() must start every environment")
+        everyone = bool(rows.all())
+        if self._state is None:
+            if not everyone:
+                raise gym.error.ResetNeeded("the first reset() must start every environment")
+            for name in ("scale", "_stream", "_episode", "_step"):  # where the readings are
+                setattr(self, name, placed(getattr(self, name), reading))
         if noise_seeds is None:
             keys: Keys = streams.bits(self._stream[rows], self._episode[rows])
-            self._episode[rows] += np.uint64(1)
+            self._episode[rows] += 1
         else:
-            chosen = [streams.key_from_seed(noise_seeds[i], _EPISODE) for i in np.flatnonzero(rows).tolist()]
-            keys = np.array(chosen, dtype=np.uint64)
+            chosen = [noise_seeds[i] for i in np.flatnonzero(rows).tolist()]
+            keys = placed(streams.seed_keys(chosen, _EPISODE), reading)
         self._step[rows] = 0
         fresh = self.model.reset(keys, reading.shape[1], self._ahead)
         noisy, fresh = self.model(reading[rows], self.scale, self._step[rows], fresh)
-        self._state = fresh if rows.all() else _put(self._state, fresh, rows)
+        self._state = fresh if everyone else _put(self._state, fresh, rows)
         return noisy
 
     def advance(self, reading: Array) -> Array:
@@ -86,7 +90,7 @@ def _put(state: Any, fresh: Any, rows: Rows) -> Any:
     """``state`` (B rows) with the given rows taken from ``fresh`` (those rows only)."""
     if isinstance(state, tuple):
         return tuple(_put(part, new, rows) for part, new in zip(state, fresh, strict=True))
-    merged = state.copy()
+    merged = own_copy(state)
     merged[rows] = fresh
     return merged
 
@@ -160,7 +164,7 @@ class ObservationNoise(gym.Wrapper, RecordConstructorArgs):
         noise_seeds, options = _noise_seeds(options, 1)
         observation, info = self.env.reset(seed=seed, options=options)
         if seed is not None:
-            self._rows.seed(0, int(seed))
+            self._rows.seed(np.ones(1, dtype=bool), [seed])
         reading = self.channels.read(observation)
         noisy = self._rows.start(reading, np.ones(1, dtype=bool), noise_seeds)
         return self._hand_out(observation, noisy, info)
@@ -232,18 +236,19 @@ class VectorObservationNoise(VectorWrapper, RecordConstructorArgs):
         """
         n = self.num_envs
         noise_seeds, options = _noise_seeds(options, n)
-        rows = np.array((options or {}).get("reset_mask", np.ones(n, dtype=bool)))
+        rows = (options or {}).get("reset_mask", np.ones(n, dtype=bool))
+        rows = np.array(rows.cpu() if hasattr(rows, "cpu") else rows)
         # The environment may pop the mask from its options: they get a dict of their own.
         clean, infos = self.env.reset(seed=seed, options=dict(options) if options else options)  # type: ignore[arg-type]
         if seed is not None:
-            seeds = [seed + i for i in range(n)] if isinstance(seed, int | np.integer) else seed
-            for i, wanted in enumerate(seeds):
-                if rows[i] and wanted is not None:
-                    self._rows.seed(i, int(wanted))
+            seeds = range(int(seed), int(seed) + n) if isinstance(seed, int | np.integer) else seed
+            named = rows & np.array([wanted is not None for wanted in seeds])
+            chosen = [seeds[i] for i in np.flatnonzero(named).tolist()]
+            self._rows.seed(named, seeds if len(chosen) == n else chosen)  # type: ignore[arg-type]
         reading = self.channels.read(clean, n)
-        noisy = reading if self._noisy is None else self._noisy.copy()
+        noisy = reading if self._noisy is None else own_copy(self._noisy)
         noisy[rows] = self._rows.start(reading, rows, noise_seeds)
-        self._done = self._done & ~rows
+        self._done = self._done & ~placed(rows, self._done)
         self._noisy = noisy
         return self.channels.write(clean, noisy, (n,)), {**infos, **self._clean_info(clean, rows)}
 
@@ -252,14 +257,14 @@ class VectorObservationNoise(VectorWrapper, RecordConstructorArgs):
         n = self.num_envs
         clean, rewards, terminated, truncated, infos = self.env.step(actions)
         reading = self.channels.read(clean, n)
-        ended = np.asarray(terminated, dtype=bool) | np.asarray(truncated, dtype=bool)
+        ended = terminated | truncated
         infos = {**infos, **self._clean_info(clean, np.ones(n, dtype=bool))}
         if self._mode == AutoresetMode.SAME_STEP and ended.any():
             noisy, infos = self._end_and_start(reading, ended, infos)
         else:
             noisy = self._rows.advance(reading)
             if self._mode == AutoresetMode.NEXT_STEP and self._done.any():
-                noisy = noisy.copy()
+                noisy = own_copy(noisy)
                 noisy[self._done] = self._rows.start(reading, self._done)
         self._done, self._noisy = ended, noisy
         return self.channels.write(clean, noisy, (n,)), rewards, terminated, truncated, infos
@@ -270,25 +275,32 @@ class VectorObservationNoise(VectorWrapper, RecordConstructorArgs):
         """A step in which ``ended`` rows give their last observation and the first of a new episode."""
         if "final_obs" not in infos:
             raise ValueError(f"{self.env} resets in the same step, but gives no infos['final_obs']")
-        finals = {i: infos["final_obs"][i] for i in np.flatnonzero(ended).tolist()}
-        last = reading.copy()
-        for i, observation in finals.items():
-            last[i] = self.channels.read(observation)
-        noisy = self._rows.advance(last).copy()
-
-        final_obs, final_info = infos["final_obs"].copy(), dict(infos.get("final_info", {}))
-        for i, observation in finals.items():
-            final_obs[i] = self.channels.write(observation, noisy[i : i + 1])
-            final_info = self._add_info(final_info, {"clean_observation": own_copy(observation)}, i)
+        final_info = dict(infos.get("final_info", {}))
+        if isinstance(infos["final_obs"], np.ndarray) and infos["final_obs"].dtype == object:
+            finals = {i: infos["final_obs"][i] for i in np.flatnonzero(ended).tolist()}
+            last = reading.copy()
+            for i, observation in finals.items():
+                last[i] = self.channels.read(observation)
+            noisy = self._rows.advance(last).copy()
+            final_obs = infos["final_obs"].copy()
+            for i, observation in finals.items():
+                final_obs[i] = self.channels.write(observation, noisy[i : i + 1])
+                final_info = self._add_info(final_info, {"clean_observation": own_copy(observation)}, i)
+        else:  # one batch, right in the rows that ended
+            noisy = own_copy(self._rows.advance(self.channels.read(infos["final_obs"], self.num_envs)))
+            final_obs = self.channels.write(infos["final_obs"], noisy, (self.num_envs,))
+            final_info |= self._clean_info(infos["final_obs"], ended)
         noisy[ended] = self._rows.start(reading, ended)
-        return noisy, {**infos, "final_obs": final_obs, "final_info": final_info, "_final_info": ended.copy()}
+        infos = {**infos, "final_obs": final_obs, "final_info": final_info, "_final_info": own_copy(ended)}
+        return noisy, infos
 
     def _clean_info(self, clean: Any, rows: Rows) -> dict[str, Any]:
         """The clean observations in the form that Gymnasium gives to infos, with masks of who has one."""
         values = own_copy(clean)
+        rows = placed(rows, next(iter(clean.values())) if isinstance(clean, dict) else clean)
         if isinstance(values, dict):
-            values |= {f"_{key}": rows.copy() for key in clean}
-        return {"clean_observation": values, "_clean_observation": rows.copy()}
+            values |= {f"_{key}": own_copy(rows) for key in clean}
+        return {"clean_observation": values, "_clean_observation": own_copy(rows)}
 
 
 def _published_scale(env: VectorEnv) -> Any:

@@ -241,7 +241,7 @@ def test_adding_models_is_composing_them():
 def test_noise_is_independent_of_the_environment_with_the_same_seed():
     seeds = np.arange(3000)
     env = np.array([np.random.default_rng(s).normal(size=5) for s in seeds])
-    keys = np.array([streams.key_from_seed(int(s), 0x6E6F6973) for s in seeds])
+    keys = streams.seed_keys(seeds, 0x6E6F6973)
     noise = corrupt("step", np.zeros((3000, 1, 5)), 1.0, keys)[:, 0]
     assert_uncorrelated(env, noise)
     assert_uncorrelated(np.abs(env), np.abs(noise))

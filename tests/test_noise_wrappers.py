@@ -98,7 +98,7 @@ def test_noise_is_that_of_the_model_and_the_scale_of_the_environment():
         ObservationNoise(Walk(), "step+episode", noise_level=2), options={"noise_seed": 7}
     )
     clean = np.stack([i["clean_observation"]["obstacle"].ravel() for i in infos]).astype(np.float64)
-    key = np.array([streams.key_from_seed(7, 0x65706973)])
+    key = streams.seed_keys([7], 0x65706973)
     expected = corrupt(StepNoise(2) + EpisodeBias(2), clean[None], [0.1, 1.0, 2.0, 0.0], key)[0]
     assert_array_equal(np.stack([o["obstacle"].ravel() for o in observations]), expected.astype(np.float32))
 

@@ -12,10 +12,11 @@ from rise_agents.experts.vehicle_cbf import VehicleCBF
 from rise_agents.experts.vehicle_guidance import Discs, Guidance, direction
 from rise_agents.experts.vehicle_mpc import VehicleMPC
 from rise_agents.rollout import rollout
-from rise_envs import streams
+from rise_envs import vehicle_compiled
 from rise_envs.geometry import unicycle
-from rise_envs.ground_vehicle import Params, observe, sample_starts
+from rise_envs.streams import seed_bases
 from rise_envs.task import task_of
+from rise_envs.vehicle_world import Params, observe, sample_starts
 
 ENV = "RISE-GroundVehicle-v0"
 TASK = task_of(ENV)
@@ -25,8 +26,10 @@ KINDS = {"cbf": VehicleCBF, "mpc": VehicleMPC}
 
 def scenes(count, n=1, key=5):
     """Observations at fair starts."""
-    keys = streams.bits(np.uint64(key), np.arange(count))
-    return observe(sample_starts(keys, n, Params()))
+    starts = sample_starts(
+        seed_bases([key] * count), np.arange(count), n, Params().constants(), vehicle_compiled
+    )
+    return observe(starts[0])
 
 
 def scene(state, goal, *discs):

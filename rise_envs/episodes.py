@@ -1,0 +1,98 @@
+"""Which episode comes next, in a single environment or in each of many that run side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from rise_envs import streams
+
+Array = Any  # of NumPy or torch
+Seeds = int | Sequence[int | None] | None
+
+
+class EpisodeStreams:
+    """The stream of episodes of each of B sub-environments: two whole numbers, no generator.
+
+    Args:
+        count: B.
+        own: makes arrays of whatever library out of NumPy's.
+    """
+
+    def __init__(self, count: int, own: Callable[[Any], Array] = lambda array: array) -> None:
+        self._count, self._own = count, own
+        self._base: Array = None  # of `streams.seed_bases`
+        self._number = own(np.zeros(count, np.int64))  # of the next episode
+
+    def seed(self, seed: Seeds, mask: NDArray[np.bool_] | None = None, rng: Any = None) -> None:
+        """Begin streams anew where the mask (default: all) and a seed say so.
+
+        Args:
+            seed: one whole number, from which sub-environments count on as Gymnasium's do, or one (or None) each.
+            mask: (B,).
+            rng: names the streams of those who were never seeded; None: the operating system does.
+
+        Raises:
+            ValueError: seeds that are not B, or no whole numbers ≥ 0. Nothing has changed then.
+        """
+        own, count = self._own, self._count
+        seeds = _each(seed, count)
+        named = np.full(count, True) if isinstance(seeds, range) else np.array([s is not None for s in seeds])
+        rows = np.flatnonzero(named if mask is None else named & mask)
+        bases = streams.seed_bases(seeds if len(rows) == count else [seeds[i] for i in rows.tolist()])
+        if self._base is None:
+            rng = rng or np.random.default_rng()
+            self._base = own(streams.seed_bases(rng.integers(2**63, size=count).tolist()))
+        if len(rows):
+            self._base[own(rows)], self._number[own(rows)] = own(bases), 0
+
+    def next(self, rows: Array) -> tuple[Array, Array]:
+        """Base and number, as `streams.episode_keys` takes them, of the next episodes of ``rows`` (indices)."""
+        base, number = self._base[rows], self._number[rows]
+        self._number[rows] = number + 1
+        return base, number
+
+
+def _each(seed: Seeds, count: int) -> Sequence[Any]:
+    """A seed, or None, for each sub-environment."""
+    if isinstance(seed, int | np.integer):
+        return range(int(seed), int(seed) + count)
+    seeds = [None] * count if seed is None else seed
+    if len(seeds) != count:
+        raise ValueError(f"expected {count} seeds, got {len(seeds)}")
+    return seeds
+
+
+def reset_mask(options: dict[str, Any] | None, count: int, first: bool) -> NDArray[np.bool_]:
+    """Which sub-environments a reset starts: ``options["reset_mask"]``, (B,), of NumPy or torch; default all.
+
+    Args:
+        options: of ``reset``.
+        count: B.
+        first: whether nothing was started yet.
+
+    Raises:
+        ValueError: no mask of booleans of length B with at least one True.
+        gymnasium.error.ResetNeeded: a mask in the first reset, which must start all.
+    """
+    mask = (options or {}).get("reset_mask", np.ones(count, bool))
+    mask = np.asarray(mask.cpu() if hasattr(mask, "cpu") else mask)
+    if mask.shape != (count,) or mask.dtype != bool or not mask.any():
+        raise ValueError(f"options['reset_mask'] must be ({count},) bool with at least one True")
+    if first and not mask.all():
+        raise gym.error.ResetNeeded("the first reset() must start every sub-environment")
+    return mask
+
+
+def check_running(ended: Array) -> None:
+    """Raise ``gymnasium.error.ResetNeeded`` if a sub-environment has ended: (B,) bool, of NumPy or torch."""
+    if bool(ended.any()):
+        which = [i for i, over in enumerate(ended.tolist()) if over]
+        raise gym.error.ResetNeeded(
+            f"sub-environments {which} have ended: reset them with "
+            "options={'reset_mask': mask} before the next step"
+        )

@@ -1,0 +1,274 @@
+"""The batched vehicle, compiled: the dynamics of :mod:`rise_envs.vehicle_dynamics` on one CPU core.
+
+Blocks of ``LANES`` vehicles are copied into rows of a scratch array, so that each loop over them becomes vector
+instructions, and back. A block that is not full is filled up with copies of its last vehicle.
+
+Shapes: B batch, N discs.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rise_envs import shared
+from rise_envs.arithmetic import mix, split, to_float, where
+from rise_envs.compiled import compiled, inlined
+from rise_envs.obstacles import DRAWS, Rules, next_velocity
+from rise_envs.vehicle_dynamics import (
+    DISC_DRAWS,
+    MAX_ATTEMPTS,
+    PLACE_DRAWS,
+    Constants,
+    clipped,
+    drive,
+    gap,
+    placed,
+    placed_disc,
+    reward,
+    swept_clearance,
+)
+from rise_envs.vehicle_world import Outcome, World
+
+Array = NDArray[np.float64]
+Whole = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+LANES = 16
+_X, _Y, _THETA, _V, _OMEGA, _GX, _GY, _PX, _PY, _VX, _VY, _RADIUS, _LEAST = range(13)
+
+
+@functools.cache
+def packed(c: Constants) -> Array:
+    """The constants as one array: unlike a tuple, compiled code takes it as an argument in no time."""
+    numbers: list[float] = []
+    for value in (*c[:-2], *c.rules, c.sparse):
+        numbers += value if isinstance(value, tuple) else [value]
+    return np.array(numbers, float)
+
+
+@compiled
+def unpacked(n: Array) -> Constants:
+    """The inverse of `packed`."""
+    rules = Rules(n[18], n[19], n[20], (n[21], n[22], n[23]), (n[24], n[25], n[26]), n[27], n[28] > 0.0)
+    goal_distance, obstacle_radius, obstacle_along = (n[8], n[9]), (n[11], n[12]), (n[13], n[14])
+    return Constants(
+        n[0],
+        n[1],
+        n[2],
+        n[3],
+        n[4],
+        n[5],
+        n[6],
+        n[7],
+        goal_distance,
+        n[10],
+        obstacle_radius,
+        obstacle_along,
+        n[15],
+        n[16],
+        n[17],
+        rules,
+        n[29] > 0.0,
+    )
+
+
+@compiled
+def step_alone(
+    now: Array, key: int, time: int, v: float, omega: float, numbers: Array, shown: Array
+) -> tuple[float, float, bool]:
+    """One step of one vehicle.
+
+    Args:
+        now: (x, y, θ, gx, gy) and the reading of each disc, (5 + 5N,); is moved on.
+        key: of the discs' motion.
+        time: steps taken so far.
+        v: linear velocity (m/s).
+        omega: angular velocity (rad/s).
+        numbers: of `packed`.
+        shown: receives (x, y, θ), (x, y), goal, readings after the step, and (x, y) before it, (9 + 5N,).
+
+    Returns:
+        The least clearance within the step, the reward, and whether the goal is reached.
+    """
+    c = unpacked(numbers)
+    n_count = (len(now) - 5) // 5
+    v, omega = clipped(v, c.v_min, c.v_max), clipped(omega, -c.omega_max, c.omega_max)
+    x, y, theta, gx, gy, least = now[0], now[1], now[2], now[3], now[4], np.inf
+    shown[5], shown[6] = gx, gy
+    for n in range(n_count):
+        d = 5 + 5 * n
+        px, py, u, w, radius = now[d], now[d + 1], now[d + 2], now[d + 3], now[d + 4]
+        near = swept_clearance((x, y, theta), v, omega, (px, py, u, w, radius), c.dt, c.robot_radius)
+        least = where(near < least, near, least)
+        px, py = px + c.dt * u, py + c.dt * w
+        counter = DRAWS * ((time + 1) * n_count + n)
+        u, w, _ = next_velocity((px, py, 0.0), (u, w, 0.0), radius, (gx, gy, 0.0), key, counter, c.rules)
+        now[d], now[d + 1], now[d + 2], now[d + 3] = px, py, u, w
+        shown[d + 2], shown[d + 3], shown[d + 4], shown[d + 5], shown[d + 6] = px, py, u, w, radius
+    before = gap(x, y, gx, gy)
+    shown[-2], shown[-1] = x, y
+    x, y, theta = drive((x, y, theta), v, omega, c.dt)
+    after = gap(x, y, gx, gy)
+    reached = after <= c.goal_radius
+    now[0], now[1], now[2] = x, y, theta
+    shown[0], shown[1], shown[2], shown[3], shown[4] = x, y, theta, x, y
+    return least, reward(before, after, reached, c), reached
+
+
+@inlined
+def _pass_discs(
+    start: int, count: int, w: Array, disc: Array, key: Whole, time: Whole, obstacle: Array, c: Constants
+) -> None:
+    """Clearances of a block of vehicles, and their discs moved on: ``count`` rows of the batch from ``start``."""
+    n_count, keys, counters = disc.shape[1], np.empty(LANES, np.int64), np.empty(LANES, np.int64)
+    for n in range(n_count):
+        for m in range(LANES):
+            b = start + min(m, count - 1)
+            w[_PX, m], w[_PY, m], w[_RADIUS, m] = disc[b, n, 0], disc[b, n, 1], disc[b, n, 4]
+            w[_VX, m], w[_VY, m] = disc[b, n, 2], disc[b, n, 3]
+            keys[m], counters[m] = key[b], DRAWS * ((time[b] + 1) * n_count + n)
+        for m in range(LANES):
+            this = (w[_PX, m], w[_PY, m], w[_VX, m], w[_VY, m], w[_RADIUS, m])
+            pose = (w[_X, m], w[_Y, m], w[_THETA, m])
+            near = swept_clearance(pose, w[_V, m], w[_OMEGA, m], this, c.dt, c.robot_radius)
+            w[_LEAST, m] = where(near < w[_LEAST, m], near, w[_LEAST, m])
+        for m in range(LANES):
+            u, v = w[_VX, m], w[_VY, m]
+            px, py = w[_PX, m] + c.dt * u, w[_PY, m] + c.dt * v
+            there, place = (w[_GX, m], w[_GY, m], 0.0), (px, py, 0.0)
+            u, v, _ = next_velocity(place, (u, v, 0.0), w[_RADIUS, m], there, keys[m], counters[m], c.rules)
+            w[_PX, m], w[_PY, m], w[_VX, m], w[_VY, m] = px, py, u, v
+        for m in range(count):
+            b, d = start + m, 5 * n
+            px, py, u, v, radius = w[_PX, m], w[_PY, m], w[_VX, m], w[_VY, m], w[_RADIUS, m]
+            disc[b, n, 0], disc[b, n, 1], disc[b, n, 2], disc[b, n, 3] = px, py, u, v
+            obstacle[b, d], obstacle[b, d + 1], obstacle[b, d + 2], obstacle[b, d + 3] = px, py, u, v
+            obstacle[b, d + 4] = radius
+
+
+@compiled
+def _advance(
+    first: int,
+    last: int,
+    state: Array,
+    goal: Array,
+    disc: Array,
+    key: Whole,
+    time: Whole,
+    action: Array,
+    numbers: Array,
+    limit: int,
+    on_collision: bool,
+    seen: Array,
+    achieved: Array,
+    shown_goal: Array,
+    obstacle: Array,
+    previous: Array,
+    clearance: Array,
+    cost: Array,
+    rewards: Array,
+    reached: Flags,
+    terminated: Flags,
+    truncated: Flags,
+) -> None:
+    """Rows ``first`` to ``last`` of `advance`; from ``seen`` on the parts of the outcome."""
+    c, w = unpacked(numbers), np.empty((13, LANES))
+    for start in range(first, last, LANES):
+        count = min(LANES, last - start)
+        for m in range(LANES):
+            b = start + min(m, count - 1)
+            w[_X, m], w[_Y, m], w[_THETA, m] = state[b, 0], state[b, 1], state[b, 2]
+            w[_GX, m], w[_GY, m], w[_LEAST, m] = goal[b, 0], goal[b, 1], np.inf
+            w[_V, m], w[_OMEGA, m] = action[b, 0], action[b, 1]
+        for m in range(LANES):
+            w[_V, m] = clipped(w[_V, m], c.v_min, c.v_max)
+            w[_OMEGA, m] = clipped(w[_OMEGA, m], -c.omega_max, c.omega_max)
+        _pass_discs(start, count, w, disc, key, time, obstacle, c)
+        for m in range(count):
+            b = start + m
+            previous[b, 0], previous[b, 1] = w[_X, m], w[_Y, m]
+        for m in range(LANES):
+            x, y, theta, gx, gy = w[_X, m], w[_Y, m], w[_THETA, m], w[_GX, m], w[_GY, m]
+            before = gap(x, y, gx, gy)
+            x, y, theta = drive((x, y, theta), w[_V, m], w[_OMEGA, m], c.dt)
+            after = gap(x, y, gx, gy)
+            arrived = after <= c.goal_radius
+            w[_X, m], w[_Y, m], w[_THETA, m] = x, y, theta
+            w[_V, m], w[_OMEGA, m] = reward(before, after, arrived, c), to_float(arrived)
+        for m in range(count):
+            b = start + m
+            x, y, theta, least, arrived = w[_X, m], w[_Y, m], w[_THETA, m], w[_LEAST, m], w[_OMEGA, m] > 0.0
+            state[b, 0], state[b, 1], state[b, 2] = x, y, theta
+            seen[b, 0], seen[b, 1], seen[b, 2] = x, y, theta
+            achieved[b, 0], achieved[b, 1] = x, y
+            shown_goal[b, 0], shown_goal[b, 1] = w[_GX, m], w[_GY, m]
+            clearance[b], cost[b], rewards[b] = least, to_float(least < 0.0), w[_V, m]
+            reached[b], terminated[b] = arrived, arrived or (on_collision and least < 0.0)
+            time[b] += 1
+            truncated[b] = time[b] >= limit
+
+
+def advance(
+    world: World, action: Array, c: Constants, limit: int, on_collision: bool, threads: int = 1
+) -> Outcome:
+    """One step of B vehicles.
+
+    Args:
+        world: is moved on, in place.
+        action: (v, ω), (B, 2).
+        c: the task.
+        limit: steps after which an episode is truncated.
+        on_collision: whether an overlap terminates the episode.
+        threads: that share the rows.
+    """
+    b_count, n_count, _ = world.disc.shape
+    widths = (3, 2, 2, 5 * n_count, 2)
+    parts = [np.empty((b_count, width)) for width in widths] + [np.empty(b_count) for _ in range(3)]
+    shown = Outcome(*parts, *(np.empty(b_count, np.bool_) for _ in range(3)))
+    arguments = (
+        *(world.state, world.goal, world.disc, world.key, world.step),
+        *(action, packed(c), limit, on_collision, *shown),
+    )
+    shared.run(lambda first, last: _advance(first, last, *arguments), b_count, LANES, threads)
+    return shown
+
+
+@compiled
+def begin(
+    base: Whole, number: Whole, n_count: int, c: Constants
+) -> tuple[Array, Array, Array, Whole, Array, bool]:
+    """Fair starts of the episodes with the given numbers of streams with the given bases, (B,) each.
+
+    Returns:
+        States, goals, discs, keys of the discs' motion, clearances (B,), and whether all are fair.
+    """
+    b_count = len(base)
+    state, goal, disc = np.empty((b_count, 3)), np.empty((b_count, 2)), np.empty((b_count, n_count, 5))
+    size = PLACE_DRAWS + DISC_DRAWS * n_count
+    motion, clearance = np.empty(b_count, np.int64), np.empty(b_count)
+    for b in range(b_count):
+        key = mix(base[b], number[b])
+        draws, motion[b] = split(key, 0), split(key, 1)
+        for attempt in range(MAX_ATTEMPTS):
+            x, y, theta, gx, gy, distance, cos, sin, valid = placed(draws, attempt * size, c)
+            least = np.inf
+            for n in range(n_count):
+                if not valid:
+                    break
+                counter = attempt * size + PLACE_DRAWS + DISC_DRAWS * n
+                px, py, u, v, r, valid = placed_disc(
+                    draws, counter, (x, y), (gx, gy), (distance, cos, sin), c
+                )
+                disc[b, n, 0], disc[b, n, 1], disc[b, n, 2], disc[b, n, 3], disc[b, n, 4] = px, py, u, v, r
+                near = gap(x, y, px, py) - r - c.robot_radius
+                least = where(near < least, near, least)
+            if valid:
+                break
+        else:
+            return state, goal, disc, motion, clearance, False
+        state[b, 0], state[b, 1], state[b, 2], goal[b, 0], goal[b, 1] = x, y, theta, gx, gy
+        clearance[b] = least
+    return state, goal, disc, motion, clearance, True
