@@ -19,7 +19,7 @@ from benchmarks.policies import make_policy
 from benchmarks.protocol import Plan, Scenarios, digest, imitates
 from benchmarks.videos import record
 from rise_agents import AGENTS, __version__, agent_class, demonstrations, make_agent
-from rise_agents.agent import Progress, make_config, silent
+from rise_agents.agent import Progress, config_to_dict, make_config, silent
 from rise_agents.rollout import rollout
 
 
@@ -52,8 +52,17 @@ def demonstrations_folder(plan: Plan, env: str, out: Path) -> Path:
 def checkpoint_path(plan: Plan, env: str, agent: str, seed: int, out: Path) -> Path:
     """Where a trained agent of a plan lies."""
     source = [plan.expert, plan.demos] if imitates(agent) else []
-    mark = digest(__version__, env, agent, seed, plan.config(agent, env), source)
+    mark = digest(__version__, env, agent, seed, complete_settings(plan, env, agent), source)
     return out / "agents" / env / f"{agent}-seed{seed}-{mark}.rise"
+
+
+def complete_settings(plan: Plan, env: str, agent: str) -> dict[str, Any]:
+    """All settings of a trained agent, the plan's and its own defaults.
+
+    Raises:
+        ValueError: one is unknown or out of range.
+    """
+    return config_to_dict(make_config(agent_class(agent), env, plan.config(agent, env)))
 
 
 def training_jobs(plan: Plan, out: Path, device: str) -> list[Job]:
@@ -116,7 +125,7 @@ def video_jobs(plan: Plan, out: Path) -> list[Job]:
             mark = digest(env, row, trained.name if trained else __version__, plan.noise_model, level, seeds)
             output = out / "videos" / f"{env}-{row}-{mark}.mp4"
             needs = (trained,) if trained else ()
-            jobs.append(Job(f"draw {row} on {env}", record, arguments, output, needs, weight=0.5))
+            jobs.append(Job(f"draw {row} on {env}", record, arguments, output, needs, weight=2.0))
     return jobs
 
 
@@ -126,7 +135,7 @@ def check_settings(plan: Plan) -> None:
         for agent in plan.agents:
             if agent in AGENTS:
                 try:
-                    make_config(agent_class(agent), env, plan.config(agent, env))
+                    complete_settings(plan, env, agent)
                 except (TypeError, ValueError) as error:
                     raise ValueError(f"settings of {agent}: {error}") from None
 

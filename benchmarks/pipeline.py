@@ -15,6 +15,7 @@ from benchmarks.executors import Failure, run_jobs
 from benchmarks.jobs import (
     Job,
     checkpoint_path,
+    complete_settings,
     demonstrations_folder,
     evaluation_jobs,
     generate_demonstrations,
@@ -23,8 +24,7 @@ from benchmarks.jobs import (
 )
 from benchmarks.labels import env_label
 from benchmarks.protocol import Plan, imitates
-from rise_agents import AGENTS, agent_class, checkpoint, demonstrations
-from rise_agents.agent import config_to_dict, make_config
+from rise_agents import AGENTS, checkpoint, demonstrations
 
 
 def execute(
@@ -84,15 +84,12 @@ def _trained(plan: Plan, out: Path) -> dict[str, dict[str, Any]]:
             path = checkpoint_path(plan, env, agent, 0, out).with_suffix(".json")
             if path.exists():
                 seconds = json.loads(path.read_text())["seconds"]
-                source = f"{plan.demos:,} expert episodes" if imitates(agent) else "trial in the environment"
+                settings = complete_settings(plan, env, agent)
+                tried = f"trial in {settings.get('train_env') or 'the environment'}"
+                source = f"{plan.demos:,} expert episodes" if imitates(agent) else tried
                 entry = {"learned from": source, "training time": f"{seconds:.0f} s"}
-                facts.setdefault(agent, {})[env] = {**entry, **_settings(plan, agent, env)}
+                facts.setdefault(agent, {})[env] = {**entry, **settings}
     return facts
-
-
-def _settings(plan: Plan, agent: str, env: str) -> dict[str, Any]:
-    """The agent's complete settings."""
-    return config_to_dict(make_config(agent_class(agent), env, plan.config(agent, env)))
 
 
 def _write_run(plan: Plan, out: Path, device: str, command: list[str]) -> None:
@@ -106,7 +103,7 @@ def _write_run(plan: Plan, out: Path, device: str, command: list[str]) -> None:
         "command": shlex.join(command),
         "plan": asdict(plan),
         "settings": {
-            f"{agent}@{env}": _settings(plan, agent, env)
+            f"{agent}@{env}": complete_settings(plan, env, agent)
             for env in plan.envs
             for agent in plan.agents
             if agent in AGENTS

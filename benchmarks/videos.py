@@ -124,6 +124,7 @@ def record(
         fps=FRAMES_PER_SECOND,
         codec="libx264",
         macro_block_size=16,
+        output_params=["-preset", "veryfast"],  # half the time of the usual one, files a tenth larger
     )
     iio.imwrite(output.with_name(f"{output.stem}-frames.png"), strip(clips[0]))
     partial.replace(output)

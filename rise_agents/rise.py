@@ -38,12 +38,11 @@ from rise_agents.agent import (
     silent,
 )
 from rise_agents.cloning import ActionUnits, CloningConfig, CloningData, Eyes
+from rise_agents.draws import NormalDraws
 from rise_agents.networks import LOG_SIGMA_RANGE, Encoder, gaussian_kl, mlp, reparameterise
 from rise_agents.training import Forward, fit, layers_of, standardised, to_arrays
-from rise_envs import streams
 
 _ONE = np.uint64(1)
-_AHEAD = 64  # steps whose draws are computed together where one episode acts alone
 _LOG_SIGMA_RANGE = tuple(np.float32(bound) for bound in LOG_SIGMA_RANGE)
 
 
@@ -242,7 +241,7 @@ class Rise:
         units, spread = self._eyes.robot, arrays["vae.spread"]
         mean, scale = np.append(units.mean, 0 * spread), np.append(units.scale, spread)
         self._policy = Forward([standardised(first, mean, scale), *rest[:-1], self.units.answering(rest[-1])])
-        self._ahead: tuple[tuple[int, int], NDArray] = (0, -1), np.zeros(0)
+        self._draws = NormalDraws(self.config.average * self.config.latent)
         return self
 
     def encode(self, reading: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -293,19 +292,6 @@ class Rise:
         """Actions of π(s, g, z) inside the bounds."""
         return self.units.clip(self._policy(robot, z))
 
-    def _draws(self, keys: NDArray[np.uint64], counter: NDArray[np.uint64]) -> NDArray[np.float32]:
-        """Standard normal ε of steps ``counter`` (B,) of the streams ``keys`` (B,): (B, average · Z)."""
-        size = self.config.average * self.config.latent
-        if len(keys) > 1 or not counter[0]:
-            return _normal(keys, counter, size)
-        # An episode on its own: its next steps' draws together cost little more than one step's.
-        block, place = divmod(int(counter[0]), _AHEAD)
-        mark = int(keys[0]), block
-        if self._ahead[0] != mark:
-            steps = block * _AHEAD + np.arange(_AHEAD, dtype=np.uint64)
-            self._ahead = mark, _normal(keys, steps, size)
-        return self._ahead[1][place : place + 1]
-
     def save(self, path: str | os.PathLike[str]) -> None:
         """Store the agent; :func:`rise_agents.load_agent` reads it."""
         cloning.save(path, self, self._arrays)
@@ -314,9 +300,3 @@ class Rise:
     def from_checkpoint(cls, arrays: dict[str, NDArray], description: dict[str, Any], device: str) -> Rise:
         """The agent that :meth:`save` stored."""
         return cls(description["env"], description["config"], description["seed"], device)._use(arrays)
-
-
-def _normal(keys: NDArray[np.uint64], steps: NDArray[np.uint64], size: int) -> NDArray[np.float32]:
-    """Draws number steps · size and following, (T, size), of each step's stream: ``keys`` are (T,) or (1,)."""
-    numbers = steps[:, None] * np.uint64(size) + np.arange(size, dtype=np.uint64)
-    return streams.normal(keys[:, None], numbers).astype(np.float32)

@@ -8,7 +8,7 @@ import torch
 
 from rise_agents import make_agent
 from rise_agents.cloning import output_size
-from rise_agents.networks import mlp
+from rise_agents.networks import FirstLinear, mlp
 from rise_agents.training import Forward, layers_of, rescaled, standardised, to_arrays
 
 VEHICLE = "RISE-GroundVehicle-v0"
@@ -30,6 +30,18 @@ def test_forward_equals_torch(hidden, rows):
     np.testing.assert_allclose(forward(x), expected, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(forward(x[:, :1], x[:, 1:]), expected, rtol=1e-5, atol=1e-5)
     assert forward(x).dtype == np.float32
+
+
+@pytest.mark.parametrize("shape", [(5,), (2, 5)])
+def test_first_layer_is_a_linear_layer(shape):
+    torch.manual_seed(0)
+    ours, theirs, x = FirstLinear(3, 4), torch.nn.Linear(3, 4), torch.randn(*shape, 3)
+    theirs.load_state_dict(ours.state_dict())
+    for layer in (ours, theirs):
+        (layer(x) ** 2).sum().backward()
+    torch.testing.assert_close(ours(x), theirs(x))
+    torch.testing.assert_close(ours.weight.grad, theirs.weight.grad)
+    torch.testing.assert_close(ours.bias.grad, theirs.bias.grad)
 
 
 def test_layers_are_found_in_order_and_by_their_whole_name():
