@@ -51,7 +51,7 @@ def reward(
             "(HerReplayBuffer(copy_info_dict=True)) or make the environment with reward_type='sparse'"
         ) from None
     before = before[0] if isinstance(info, dict) else before
-    return (distance(before, desired_goal) - gap) / goal_radius + reached
+    return (distance(before, desired_goal) - gap) * (1.0 / goal_radius) + reached
 
 
 def terminated(

@@ -9,14 +9,21 @@ processes share them, and a whole batch is drawn with a handful of array operati
 
 from __future__ import annotations
 
+import operator
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from rise_envs import arithmetic
 
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _MIX1 = np.uint64(0xBF58476D1CE4E5B9)
 _MIX2 = np.uint64(0x94D049BB133111EB)
 _S30, _S27, _S31, _S11 = (np.uint64(s) for s in (30, 27, 31, 11))
+_PAIR = np.array([0, 1], np.uint64)
 _TO_UNIT = np.float64(2.0**-53)
+_EPISODES = 3  # tag of the streams that episodes come from
 
 
 def bits(key: ArrayLike, counter: ArrayLike) -> NDArray[np.uint64]:
@@ -42,9 +49,10 @@ def uniform(key: ArrayLike, counter: ArrayLike) -> NDArray[np.float64]:
 
 def normal(key: ArrayLike, counter: ArrayLike) -> NDArray[np.float64]:
     """Draws from N(0, 1), one for each pair of ``key`` and ``counter`` (Box and Muller, 1958)."""
-    counter = np.asarray(counter, dtype=np.uint64) * np.uint64(2)
-    radius = np.sqrt(-2.0 * np.log1p(-uniform(key, counter)))
-    return radius * np.cos(2.0 * np.pi * uniform(key, counter + np.uint64(1)))
+    # Both uniform draws in one pass: for the few numbers that one agent wants, the calls are what costs.
+    counter = np.asarray(counter, dtype=np.uint64)[..., None] * np.uint64(2) + _PAIR
+    draws = uniform(np.asarray(key, dtype=np.uint64)[..., None], counter)
+    return np.sqrt(-2.0 * np.log1p(-draws[..., 0])) * np.cos(2.0 * np.pi * draws[..., 1])
 
 
 def key_from_seed(seed: int, tag: int = 1) -> np.uint64:
@@ -56,6 +64,43 @@ def key_from_seed(seed: int, tag: int = 1) -> np.uint64:
     if tag < 1:
         raise ValueError(f"tag must be at least 1, got {tag}")
     return np.random.SeedSequence((seed, tag)).generate_state(1, np.uint64)[0]
+
+
+def seed_bases(seeds: Sequence[int] | NDArray[np.uint64]) -> NDArray[np.int64]:
+    """Where the episodes of environments with these seeds come from: see `episode_keys`.
+
+    Args:
+        seeds: whole numbers ≥ 0, (B,).
+
+    Raises:
+        ValueError: a seed that is negative or no whole number.
+    """
+    if not isinstance(seeds, np.ndarray):
+        seeds = np.array([_word(seed) for seed in seeds], np.uint64)
+    return split(seeds, _EPISODES).view(np.int64)
+
+
+def _word(seed: int) -> int:
+    """A seed as 64 bits: itself, if it is no longer."""
+    try:
+        whole = operator.index(seed)
+    except TypeError:
+        raise ValueError(f"a seed must be a whole number, got {seed!r}") from None
+    if whole < 0:
+        raise ValueError(f"a seed must not be negative, got {whole}")
+    return whole if whole < 2**64 else int(key_from_seed(whole))
+
+
+def episode_keys(base: NDArray, number: NDArray) -> NDArray:
+    """Keys, (B,), of the episodes with these numbers (0, 1, …) since seeding.
+
+    Nothing but two whole numbers per environment has to be kept, and a thousand episodes start as fast as one.
+
+    Args:
+        base: of `seed_bases`, int64 of any array library, (B,).
+        number: int64, (B,).
+    """
+    return arithmetic.mix(base, number)
 
 
 def draw_key(rng: np.random.Generator) -> np.uint64:

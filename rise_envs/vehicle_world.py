@@ -1,21 +1,22 @@
-"""The world of ``RISE-GroundVehicle-v0``: its constants, its fair starts and its dynamics, pure and batched.
+"""The world of ``RISE-GroundVehicle-v0``: its constants, and its episodes as arrays of NumPy or torch.
 
 The single and the batched environment both stand on this file, so they cannot differ.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
+from array_api_compat import array_namespace
 from numpy.typing import NDArray
 
-from rise_envs import geometry, obstacles, streams
+from rise_envs.arithmetic import sqrt
 from rise_envs.obstacles import Motion
+from rise_envs.vehicle_dynamics import MAX_ATTEMPTS, Constants
 
 Array = NDArray[np.float64]
-MAX_ATTEMPTS = 2_000
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,8 @@ class Params:
             raise ValueError(f"dt, goal_radius, redraw_interval must be > 0 and v_min ≤ v_max, got {self}")
         if self.goal_distance[0] <= self.goal_radius:
             raise ValueError(f"goal_distance must exceed goal_radius, or episodes start at the goal: {self}")
+        if self.omega_max * self.dt > 1:
+            raise ValueError(f"omega_max · dt must be ≤ 1: no step turns by more than 1 rad, got {self}")
 
     @property
     def motion(self) -> Motion:
@@ -62,109 +65,84 @@ class Params:
         low = (-self.obstacle_half, -self.obstacle_half)
         return Motion(self.dt, self.obstacle_speed, self.redraw_interval, low, high, self.goal_gap)
 
+    def constants(self, sparse: bool = False) -> Constants:
+        """The task as plain numbers, for what is written by coordinates."""
+        values = {name: getattr(self, name) for name in Constants._fields if hasattr(self, name)}
+        return Constants(
+            **{name: tuple(map(float, v)) if isinstance(v, tuple) else float(v) for name, v in values.items()},
+            per_goal_radius=1.0 / self.goal_radius,
+            rules=self.motion.rules,
+            sparse=sparse,
+        )
+
 
 @dataclass
 class World:
-    """The true state of B episodes: vehicle, goal and N discs. Arrays are replaced, never written into."""
+    """The true state of B episodes: vehicle, goal and N discs, as arrays of NumPy or torch.
 
-    state: Array  # (B, 3)
-    goal: Array  # (B, 2)
-    position: Array  # (B, N, 2)
-    velocity: Array  # (B, N, 2), in the coming step
-    radius: Array  # (B, N)
-    key: NDArray[np.uint64]  # (B,)
-    step: NDArray[np.int64]  # (B,)
+    Arrays are replaced, never written into.
+    """
 
-    def merge(self, other: World, rows: NDArray[np.bool_]) -> World:
-        """This world with the given ``rows`` (B,) bool taken from ``other``, which holds only those."""
-        merged = {name: array.copy() for name, array in vars(self).items()}
-        for name, array in merged.items():
-            array[rows] = getattr(other, name)
-        return World(**merged)
+    state: Any  # (x, y, θ), (B, 3)
+    goal: Any  # (B, 2)
+    disc: Any  # readings (px, py, vx, vy, r), the velocity that of the coming step, (B, N, 5)
+    key: Any  # of the discs' motion, (B,) int64
+    step: Any  # steps taken, (B,) int64
 
+    @property
+    def position(self) -> Any:
+        """Centres of the discs (m), (B, N, 2)."""
+        return self.disc[..., :2]
 
-def _propose(keys: NDArray[np.uint64], attempt: int, n: int, p: Params) -> tuple[World, NDArray[np.bool_]]:
-    """One candidate start per key (B,), and which candidates are valid."""
-    size = 5 + 3 * n
-    u = streams.uniform(keys[:, None], attempt * size + np.arange(size))
+    @property
+    def velocity(self) -> Any:
+        """Velocities of the discs in the coming step (m/s), (B, N, 2)."""
+        return self.disc[..., 2:4]
 
-    def draw(column: Any, low: float, high: float) -> Array:
-        return low + (high - low) * u[:, column]
-
-    start = draw([0, 1], -p.arena_half, p.arena_half)
-    course, distance = draw(2, -np.pi, np.pi), draw(3, *p.goal_distance)
-    ahead = np.stack((np.cos(course), np.sin(course)), -1)
-    goal = start + distance[:, None] * ahead
-    heading = geometry.wrap_angle(course + draw(4, -p.heading_spread, p.heading_spread))
-
-    along = draw(slice(5, 5 + n), *p.obstacle_along) * distance[:, None]
-    aside = draw(slice(5 + n, 5 + 2 * n), -p.obstacle_offset, p.obstacle_offset)
-    radius = draw(slice(5 + 2 * n, 5 + 3 * n), *p.obstacle_radius)
-    left = np.stack((-ahead[:, 1], ahead[:, 0]), -1)
-    position = start[:, None] + along[..., None] * ahead[:, None] + aside[..., None] * left[:, None]
-    velocity = obstacles.draw_velocity(streams.split(keys, 2), attempt, n, p.motion)
-    velocity = obstacles.keep_inside(position, velocity, radius, goal, p.motion)
-
-    offset = position - start[:, None]
-    swept = geometry.segment_distance(offset, offset + p.start_horizon * velocity) - radius - p.robot_radius
-    valid = (np.abs(goal) <= p.arena_half).all(-1)
-    valid &= (swept >= p.start_margin).all(-1)
-    valid &= (np.abs(position) <= p.obstacle_half).all((-1, -2))
-    valid &= (np.linalg.norm(position - goal[:, None], axis=-1) >= radius + p.goal_gap).all(-1)
-    state = np.concatenate((start, heading[:, None]), -1)
-    return World(state, goal, position, velocity, radius, keys, np.zeros(len(keys), np.int64)), valid
+    @property
+    def radius(self) -> Any:
+        """Radii of the discs (m), (B, N)."""
+        return self.disc[..., 4]
 
 
-def sample_starts(keys: NDArray[np.uint64], n_obstacles: int, params: Params) -> World:
-    """Fair starts, one for each episode key (B,), each a pure function of its key.
+def sample_starts(keys: Any, n_obstacles: int, constants: Constants, backend: Any) -> World:
+    """Fair starts, one for each episode key (B,) int64, each a pure function of its key.
+
+    Args:
+        keys: of the episodes.
+        n_obstacles: N.
+        constants: the task.
+        backend: :mod:`rise_envs.vehicle_compiled` or :mod:`rise_envs.vehicle_arrays`.
 
     Raises:
         ValueError: the parameters leave no room for a fair start.
     """
-    draws = streams.split(keys, 0)
-    world, valid = _propose(draws, 0, n_obstacles, params)
-    for attempt in range(1, MAX_ATTEMPTS):
-        if valid.all():
-            return replace(world, key=keys)
-        missing = ~valid
-        candidate, valid[missing] = _propose(draws[missing], attempt, n_obstacles, params)
-        world = world.merge(candidate, missing)
-    raise ValueError(f"no fair start in {MAX_ATTEMPTS} draws for n_obstacles={n_obstacles} and {params}")
+    state, goal, disc, motion, fair = backend.begin(keys, n_obstacles, constants)
+    if not fair:
+        raise ValueError(
+            f"no fair start in {MAX_ATTEMPTS} draws for n_obstacles={n_obstacles} and {constants}"
+        )
+    return World(state, goal, disc, motion, motion * 0)
 
 
-def advance(world: World, action: Array, params: Params) -> tuple[World, Array]:
-    """One step of the task's dynamics.
-
-    Args:
-        world: B episodes.
-        action: (v, ω) inside the bounds, (B, 2).
-        params: constants of the task.
-
-    Returns:
-        The world after the step, and the least clearance (m) over the step and all discs, (B,).
-    """
-    clearance = geometry.swept_clearance(
-        world.state, action, world.position, world.velocity, world.radius, params.dt, params.robot_radius
-    )
-    position, step = world.position + params.dt * world.velocity, world.step + 1
-    velocity = obstacles.redraw(world.velocity, streams.split(world.key, 1), step, params.motion)
-    velocity = obstacles.keep_inside(position, velocity, world.radius, world.goal, params.motion)
-    state = geometry.unicycle(world.state, action, params.dt)
-    moved = World(state, world.goal, position, velocity, world.radius, world.key, step)
-    return moved, clearance.min(-1)
-
-
-def start_clearance(world: World, params: Params) -> Array:
+def start_clearance(world: World, constants: Constants) -> Any:
     """Clearance (B,) at an instant, in m."""
-    distance = np.linalg.norm(world.position - world.state[:, None, :2], axis=-1)
-    return (distance - world.radius - params.robot_radius).min(-1)
+    xp = array_namespace(world.state)
+    x, y = (world.position[..., i] - world.state[:, None, i] for i in (0, 1))
+    distance = sqrt(x * x + y * y)
+    return xp.min(distance - world.radius - constants.robot_radius, axis=-1)
 
 
-def observe(world: World) -> dict[str, Array]:
+def observe(world: World) -> dict[str, Any]:
     """The true observation of B episodes (every array is the caller's own)."""
     return {
-        "observation": world.state.copy(),
-        "achieved_goal": world.state[:, :2].copy(),
-        "desired_goal": world.goal.copy(),
-        "obstacle": obstacles.readings(world.position, world.velocity, world.radius),
+        "observation": copied(world.state),
+        "achieved_goal": copied(world.state[:, :2]),
+        "desired_goal": copied(world.goal),
+        "obstacle": copied(world.disc).reshape(len(world.state), -1),
     }
+
+
+def copied(array: Any) -> Any:
+    """A copy of an array of NumPy or torch."""
+    return array.copy() if isinstance(array, np.ndarray) else array.clone()

@@ -1,0 +1,83 @@
+"""Where the batched vehicles are computed, and whose arrays are handed out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from rise_envs.actions import finite_action
+
+BACKENDS = ("numpy", "torch")
+
+
+@dataclass(frozen=True)
+class Backend:
+    """A way to compute.
+
+    Attributes:
+        dynamics: the module whose ``step`` and ``begin`` move the vehicles.
+        whole: makes the arrays that they run on out of NumPy's.
+        give: makes what is handed out of the arrays that they run on.
+        action: checks an action and makes an array to run on of it: (action, shape) -> (B, 2).
+    """
+
+    dynamics: Any
+    whole: Callable[[Any], Any]
+    give: Callable[[Any], Any]
+    action: Callable[[Any, tuple[int, ...]], Any]
+
+
+def choose(backend: str, device: str, compiled: bool | None) -> Backend:
+    """The backend of these names; ``compiled`` is the default where it can be had, on the CPU.
+
+    Raises:
+        ValueError: an unknown backend or device, or compiled dynamics elsewhere than on the CPU.
+    """
+    if backend not in BACKENDS:
+        raise ValueError(f"backend must be one of {BACKENDS}, got {backend!r}")
+    on_cpu = str(device) == "cpu"
+    if compiled is None:
+        compiled = on_cpu
+    if backend == "numpy" and not on_cpu:
+        raise ValueError(f"backend 'numpy' runs on the CPU, not on device {device!r}: take backend='torch'")
+    if compiled and not on_cpu:
+        raise ValueError(f"compiled=True runs on the CPU, not on device {device!r}")
+    if compiled:
+        from rise_envs import vehicle_compiled as dynamics  # numba is loaded by those who need it only
+    else:
+        from rise_envs import vehicle_arrays as dynamics  # type: ignore[no-redef]
+    if backend == "numpy":
+        return Backend(dynamics, _same, _same, finite_action)
+    return _with_torch(dynamics, device, compiled)
+
+
+def _same(array: Any) -> Any:
+    return array
+
+
+def _with_torch(dynamics: Any, device: str, compiled: bool) -> Backend:
+    import torch
+
+    try:
+        place = torch.device(device)
+        torch.zeros(1, device=place)
+    except RuntimeError as error:
+        reason = str(error).splitlines()[0]
+        raise ValueError(f"torch cannot use device {device!r}: {reason}") from None
+
+    def action(values: Any, shape: tuple[int, ...]) -> Any:
+        if not isinstance(values, torch.Tensor):
+            values = torch.from_numpy(finite_action(values, shape))
+        elif values.shape != shape or values.dtype.is_complex:
+            raise ValueError(f"action must be real with shape {shape}, got {tuple(values.shape)}, {values.dtype}")
+        elif not bool(torch.isfinite(values).all()):
+            where = torch.nonzero(~torch.isfinite(values))[0].tolist()
+            raise ValueError(f"action must be finite, got {values[tuple(where)].item()} at index {where}")
+        return values.detach().to(place, torch.float64).contiguous()
+
+    if compiled:  # tensors and arrays share their memory on the CPU
+        return Backend(dynamics, _same, torch.from_numpy, lambda a, shape: action(a, shape).numpy())
+    return Backend(dynamics, lambda array: torch.as_tensor(np.asarray(array), device=place), _same, action)
