@@ -16,6 +16,7 @@ from rise_envs.noise_wrappers import ObservationNoise, VectorObservationNoise
 __all__ = [
     "ENVS",
     "NOISE_MODELS",
+    "STAND_INS",
     "CostFromTuple",
     "CostToTuple",
     "NoiseModel",
@@ -34,7 +35,15 @@ ENVS: dict[str, tuple[str, str | None, int]] = {
         200,
     ),
     "RISE-SafePanda-v0": ("rise_envs.safe_panda:SafePandaEnv", None, 50),
+    "RISE-SafePandaKinematic-v0": (
+        "rise_envs.safe_panda_kinematic:SafePandaKinematicEnv",
+        "rise_envs.safe_panda_kinematic_vector:SafePandaKinematicVectorEnv",
+        50,
+    ),
 }
+
+# id -> the environment that it models. To train on; results are reported from the one that is modelled.
+STAND_INS = {"RISE-SafePandaKinematic-v0": "RISE-SafePanda-v0"}
 
 for _id, (_entry, _vector_entry, _steps) in ENVS.items():
     if _id not in gym.registry:

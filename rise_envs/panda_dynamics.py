@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from rise_envs.panda_lanes import LANES, ONE, REAL, ZERO, Lanes, N, fixed
+from rise_envs.panda_lanes import LANES, ONE, REAL, ZERO, Lanes, N, compiled, fixed
 
 Array = NDArray[np.float64]
 
@@ -70,7 +69,7 @@ def _inertias() -> tuple[Array, Array, Array]:
 _MASS, _CENTER, _INERTIA = (part.astype(REAL) for part in _inertias())
 
 
-@njit(cache=True, fastmath=True)
+@compiled
 def write_bodies(axes: Lanes, origin: Lanes, speed: Lanes, spatial: Lanes, body: Lanes, twist: Lanes) -> None:
     """Inertias of the bodies and the forces that their motion at constant joint speeds takes, in place.
 
@@ -174,7 +173,7 @@ def write_bodies(axes: Lanes, origin: Lanes, speed: Lanes, spatial: Lanes, body:
             body[k, 12, m], body[k, 13, m], body[k, 14, m] = d0, d1, d2
 
 
-@njit(cache=True, fastmath=True)
+@compiled
 def write_dynamics(twist: Lanes, body: Lanes, force: Lanes, matrix: Lanes, torque: Lanes) -> None:
     """Mass matrices (7, 7, L), lower triangle, and −bias torques (7, L): composite bodies, from the hand backwards.
 

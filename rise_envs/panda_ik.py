@@ -9,7 +9,6 @@ computed, and the steps between cost one solve each.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from rise_envs.panda_lanes import (
     LANES,
@@ -18,6 +17,7 @@ from rise_envs.panda_lanes import (
     ZERO,
     Lanes,
     N,
+    compiled,
     factor,
     fixed,
     solve,
@@ -40,7 +40,7 @@ _ARC = np.array([1 / 6, 3 / 40, 15 / 336, 105 / 3456, 945 / 42240], REAL)
 _MIDDLE = REAL(0.5)
 
 
-@njit(cache=True, fastmath=True)
+@compiled
 def write_error(axes: Lanes, hand: Lanes, target: Lanes, error: Lanes) -> None:
     """Position error (m) and rotation vector (rad) from the hand to its target, (6, L)."""
     axes, error = fixed(axes, (N + 1, 3, 3, LANES)), fixed(error, (6, LANES))
@@ -60,7 +60,7 @@ def write_error(axes: Lanes, hand: Lanes, target: Lanes, error: Lanes) -> None:
             error[r, m] = target[r, m] - hand[r, m]
 
 
-@njit(cache=True, fastmath=True)
+@compiled
 def _iterate(count: int, gram: Lanes, error: Lanes, total: Lanes) -> None:
     """Sum of the solutions of ``count`` steps with the factored ``gram``; ``error`` is what they leave, (6, L)."""
     gram, error, total = fixed(gram, (6, 6, LANES)), fixed(error, (6, LANES)), fixed(total, (6, LANES))
@@ -79,7 +79,7 @@ def _iterate(count: int, gram: Lanes, error: Lanes, total: Lanes) -> None:
                 error[i, m] = _DAMPING * solution[i, m] if goes else error[i, m]
 
 
-@njit(cache=True, fastmath=True)
+@compiled
 def _write_change(jacobian: Lanes, total: Lanes, change: Lanes) -> None:
     """Joint steps Jᵀ·total (7, L), shortened if a joint would turn too far."""
     jacobian, total = fixed(jacobian, (6, N, LANES)), fixed(total, (6, LANES))
@@ -97,7 +97,7 @@ def _write_change(jacobian: Lanes, total: Lanes, change: Lanes) -> None:
             change[k, m] *= shorter
 
 
-@njit(cache=True, fastmath=True)
+@compiled
 def aim(
     cos: Lanes,
     sin: Lanes,

@@ -10,6 +10,9 @@ in :mod:`rise_envs.panda_kinematics`.
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -33,6 +36,19 @@ _COS = np.array([1 / 2, 1 / 12, 1 / 30, 1 / 56], REAL)
 _SIN = np.array([1 / 6, 1 / 20, 1 / 42, 1 / 72], REAL)
 
 
+# Whoever adds a file of lanes adds it here: all are compiled anew when one of them changes.
+_FILES = ("kinematics", "lanes", "ik", "dynamics", "motors", "clearance", "motion")
+_SOURCES = "".join(Path(__file__).with_name(f"panda_{name}.py").read_text() for name in _FILES)
+_DIGEST = hashlib.sha256(_SOURCES.encode()).hexdigest()[:12]
+
+
+def compiled(function: Callable) -> Any:
+    """``function``, compiled on its first call and kept on disk."""
+    # numba's cache watches the function's own file only; its name makes it watch what it is built on, too.
+    function.__qualname__ += f"_{_DIGEST}"
+    return njit(cache=True, fastmath=True)(function)
+
+
 @intrinsic
 def _pointer(context: Any, address: Any) -> Any:
     """A number as the address of numbers."""
@@ -49,7 +65,7 @@ def fixed(array: Lanes, shape: tuple[int, ...]) -> Lanes:
     return carray(_pointer(array.ctypes.data), shape)  # type: ignore[call-arg]
 
 
-@njit(cache=True, fastmath=True)
+@compiled
 def turn(cos: Lanes, sin: Lanes, angle: Lanes) -> None:
     """Turn cosines and sines (7, L) by ``angle`` (7, L), at most 1 rad, in place: no call to a sine."""
     cos, sin, angle = fixed(cos, (N, LANES)), fixed(sin, (N, LANES)), fixed(angle, (N, LANES))
@@ -64,7 +80,7 @@ def turn(cos: Lanes, sin: Lanes, angle: Lanes) -> None:
             sin[i, m] = sin[i, m] * c + x * t
 
 
-@njit(cache=True, fastmath=True)
+@compiled
 def write_turns(angle: Lanes, cos: Lanes, sin: Lanes, part: Lanes) -> None:
     """Cosines and sines (7, L) of ``angle`` (7, L), at most 8 rad; ``part`` (7, L) is scratch."""
     cos, sin, angle = fixed(cos, (N, LANES)), fixed(sin, (N, LANES)), fixed(angle, (N, LANES))
@@ -81,7 +97,7 @@ def write_turns(angle: Lanes, cos: Lanes, sin: Lanes, part: Lanes) -> None:
                 cos[i, m], sin[i, m] = ONE - TWO * s * s, TWO * s * c
 
 
-@njit(cache=True, fastmath=True)
+@compiled
 def write_frames(cos: Lanes, sin: Lanes, axes: Lanes, origin: Lanes) -> None:
     """Frames 0 to 7: axes as columns (8, 3, 3, L) and origins (8, 3, L), of which frame 0 is given."""
     cos, sin = fixed(cos, (N, LANES)), fixed(sin, (N, LANES))
@@ -100,7 +116,7 @@ def write_frames(cos: Lanes, sin: Lanes, axes: Lanes, origin: Lanes) -> None:
                 axes[i + 1, r, 2, m] = straight * z - turned * y
 
 
-@njit(cache=True, fastmath=True)
+@compiled
 def write_hand(axes: Lanes, origin: Lanes, hand: Lanes) -> None:
     """The hand point (3, L)."""
     axes, origin = fixed(axes, (N + 1, 3, 3, LANES)), fixed(origin, (N + 1, 3, LANES))
@@ -110,7 +126,7 @@ def write_hand(axes: Lanes, origin: Lanes, hand: Lanes) -> None:
             hand[r, m] = origin[N, r, m] + HAND_POINT * axes[N, r, 2, m]
 
 
-@njit(cache=True, fastmath=True)
+@compiled
 def write_jacobian(axes: Lanes, origin: Lanes, hand: Lanes, jacobian: Lanes) -> None:
     """Geometric Jacobian of the hand point, (6, 7, L)."""
     axes, origin = fixed(axes, (N + 1, 3, 3, LANES)), fixed(origin, (N + 1, 3, LANES))
@@ -126,7 +142,7 @@ def write_jacobian(axes: Lanes, origin: Lanes, hand: Lanes, jacobian: Lanes) -> 
             jacobian[3, i, m], jacobian[4, i, m], jacobian[5, i, m] = ax, ay, az
 
 
-@njit(cache=True, fastmath=True)
+@compiled
 def write_gram(jacobian: Lanes, damping: float, gram: Lanes) -> None:
     """The lower triangle of JJᵀ + damping·I, (6, 6, L)."""
     jacobian, gram = fixed(jacobian, (6, N, LANES)), fixed(gram, (6, 6, LANES))
@@ -140,7 +156,7 @@ def write_gram(jacobian: Lanes, damping: float, gram: Lanes) -> None:
                 gram[i, j, m] = total
 
 
-@njit(cache=True, fastmath=True)
+@compiled
 def factor(matrix: Lanes) -> None:
     """Cholesky factors of positive definite matrices (6, 6, L), lower triangles, their diagonals inverted."""
     matrix = fixed(matrix, (6, 6, LANES))
@@ -155,7 +171,7 @@ def factor(matrix: Lanes) -> None:
                     matrix[i, k, m] -= matrix[i, j, m] * matrix[k, j, m]
 
 
-@njit(cache=True, fastmath=True)
+@compiled
 def solve(matrix: Lanes, x: Lanes) -> None:
     """Solve for six unknowns: ``x`` (6, L) becomes the solution, ``matrix`` (6, 6, L) is that of `factor`."""
     matrix, x = fixed(matrix, (6, 6, LANES)), fixed(x, (6, LANES))
@@ -172,7 +188,7 @@ def solve(matrix: Lanes, x: Lanes) -> None:
             x[j, m] = total * matrix[j, j, m]
 
 
-@njit(cache=True, fastmath=True)
+@compiled
 def _sweep(p: int, matrix: Lanes, row: Lanes) -> None:
     """Sweep pivot ``p`` out of the lower triangles of symmetric matrices (7, 7, L); ``row`` (7, L) is scratch."""
     lanes = row.shape[-1]
@@ -194,7 +210,7 @@ def _sweep(p: int, matrix: Lanes, row: Lanes) -> None:
             matrix[a, b, m] = -row[p, m] if i == p else row[i, m] * row[p, m]
 
 
-@njit(cache=True, fastmath=True)
+@compiled
 def invert(matrix: Lanes, row: Lanes) -> None:
     """The inverse of positive definite matrices (7, 7, L) given by their lower triangles.
 

@@ -25,18 +25,20 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from rise_envs.panda_clearance import look
 from rise_envs.panda_dynamics import write_bodies, write_dynamics
 from rise_envs.panda_ik import aim
-from rise_envs.panda_kinematics import BASE, NEUTRAL, hand_position
+from rise_envs.panda_kinematics import BASE, NEUTRAL
 from rise_envs.panda_lanes import (
     LANES,
     ONE,
     REAL,
+    ZERO,
     Lanes,
     N,
+    compiled,
     fixed,
     invert,
     turn,
@@ -46,6 +48,7 @@ from rise_envs.panda_lanes import (
     write_turns,
 )
 from rise_envs.panda_motors import DT, LACK, N_GAINS, N_SCRATCH, motors, write_gains
+from rise_envs.panda_scene import START_HAND
 
 Array = NDArray[np.float64]
 
@@ -80,9 +83,13 @@ class Block(NamedTuple):
     torque: Lanes  # what holds the arm against gravity and its own motion, negative (N m), (7, L)
     free: Lanes  # joint accelerations without motors (rad/s²), (7, L)
     motors: Lanes  # scratch of `motors`, (N_SCRATCH, L)
+    sphere: Lanes  # centre (m) and velocity (m/s) of the sphere where the step begins, (6, L)
+    center: Lanes  # of the sphere now (m), (3, L)
+    least: Lanes  # distance of the arm's surface from that centre within the step (m), (L,)
+    nearest: Lanes  # the capsule that has it, (L,)
 
 
-@njit(cache=True)
+@compiled
 def _make_block() -> Block:
     axes, origin = np.zeros((N + 1, 3, 3, LANES), REAL), np.zeros((N + 1, 3, LANES), REAL)
     for r in range(3):
@@ -112,10 +119,14 @@ def _make_block() -> Block:
         np.zeros((N, LANES), REAL),
         np.zeros((N, LANES), REAL),
         np.zeros((N_SCRATCH, LANES), REAL),
+        np.zeros((6, LANES), REAL),
+        np.zeros((3, LANES), REAL),
+        np.zeros(LANES, REAL),
+        np.zeros(LANES, REAL),
     )
 
 
-@njit(cache=True, fastmath=True)
+@compiled
 def _aim(w: Block) -> None:
     """Bullet's joint angles ``aim`` for the hand's targets; leaves frames, cosines and sines there."""
     w.aim[:] = w.q
@@ -135,7 +146,7 @@ def _aim(w: Block) -> None:
     )
 
 
-@njit(cache=True, fastmath=True)
+@compiled
 def _renew(w: Block) -> None:
     """Inverse mass matrix and free accelerations at the present angles and speeds."""
     turn(w.cos, w.sin, w.change)
@@ -148,7 +159,7 @@ def _renew(w: Block) -> None:
     _write_product(w.inverse, w.torque, w.free)
 
 
-@njit(cache=True, fastmath=True)
+@compiled
 def _write_product(matrix: Lanes, x: Lanes, y: Lanes) -> None:
     """Products ``y`` = matrix · x, (7, L)."""
     matrix, x, y = fixed(matrix, (N, N, LANES)), fixed(x, (N, LANES)), fixed(y, (N, LANES))
@@ -160,7 +171,7 @@ def _write_product(matrix: Lanes, x: Lanes, y: Lanes) -> None:
             y[i, m] = total
 
 
-@njit(cache=True, fastmath=True)
+@compiled
 def _write_lack(w: Block) -> None:
     """What the joint velocities lack before the motors act; ``speed`` receives what the motors pull to."""
     for i in range(N):
@@ -170,7 +181,17 @@ def _write_lack(w: Block) -> None:
             w.speed[i, m] = wanted
 
 
-@njit(cache=True, fastmath=True)
+@compiled
+def _look(w: Block, substep: int) -> None:
+    """Compare the arms, whose frames are those at the beginning of ``substep``, with their spheres."""
+    time = _DT * REAL(substep)
+    for r in range(3):
+        for m in range(LANES):
+            w.center[r, m] = w.sphere[r, m] + time * w.sphere[3 + r, m]
+    look(w.axes, w.origin, w.center, w.least, w.nearest)
+
+
+@compiled
 def _move(w: Block) -> None:
     """One control step of a block: angles and speeds go on, ``hand`` is what Bullet reports after it."""
     write_turns(w.q, w.cos, w.sin, w.change)
@@ -180,21 +201,39 @@ def _move(w: Block) -> None:
     for substep in range(SUBSTEPS):
         if substep % _RENEW == 0:
             _renew(w)
+            _look(w, substep)
         _write_lack(w)
         motors(w.inverse, w.gains, w.motors)
         if substep == SUBSTEPS - 1:  # the engine reports the hand where its last substep began
             turn(w.cos, w.sin, w.change)
             write_frames(w.cos, w.sin, w.axes, w.origin)
             write_hand(w.axes, w.origin, w.hand)
+            write_jacobian(w.axes, w.origin, w.hand, w.jacobian)
         for i in range(N):
             for m in range(LANES):
                 w.speed[i, m] -= w.motors[LACK + i, m]
                 w.q[i, m] += _DT * w.speed[i, m]
-                w.change[i, m] += _DT * w.speed[i, m]
+                change = _DT * w.speed[i, m]
+                w.change[i, m] = change if substep == SUBSTEPS - 1 else w.change[i, m] + change
+    turn(w.cos, w.sin, w.change)
+    write_frames(w.cos, w.sin, w.axes, w.origin)
+    _look(w, SUBSTEPS)
 
 
-@njit(cache=True)
-def _step(q: Array, speed: Array, hand: Array, velocity: Array, action: Array) -> None:
+@compiled
+def _step(
+    q: Array,
+    speed: Array,
+    hand: Array,
+    action: Array,
+    sphere: Array,
+    new_q: Array,
+    new_speed: Array,
+    new_hand: Array,
+    velocity: Array,
+    clearance: Array,
+    nearest: NDArray[np.int64],
+) -> None:
     w = _make_block()
     count = len(q)
     for first in range(0, count, LANES):
@@ -204,22 +243,27 @@ def _step(q: Array, speed: Array, hand: Array, velocity: Array, action: Array) -
                 w.q[i, m], w.speed[i, m] = q[b, i], speed[b, i]
             for r in range(3):
                 w.target[r, m] = hand[b, r] + STEP * min(1.0, max(-1.0, action[b, r]))
-            w.target[2, m] = max(REAL(0), w.target[2, m])
+            w.target[2, m] = max(ZERO, w.target[2, m])
+            for r in range(6):
+                w.sphere[r, m] = sphere[b, r]
+            w.least[m] = np.inf
         _move(w)
-        write_jacobian(w.axes, w.origin, w.hand, w.jacobian)
         for m in range(min(LANES, count - first)):
+            b = first + m
             for i in range(N):
-                q[first + m, i], speed[first + m, i] = w.q[i, m], w.speed[i, m]
+                new_q[b, i], new_speed[b, i] = w.q[i, m], w.speed[i, m]
             for r in range(3):
-                total = 0.0
+                total = ZERO
                 for i in range(N):
                     total += w.jacobian[r, i, m] * w.speed[i, m]
-                hand[first + m, r], velocity[first + m, r] = w.hand[r, m], total
+                new_hand[b, r], velocity[b, r] = w.hand[r, m], total
+            clearance[b] = w.least[m] - sphere[b, 6]
+            nearest[b] = int(w.nearest[m])
 
 
-@dataclass
+@dataclass(frozen=True)
 class Arms:
-    """B arms in motion. The arrays are written into by `step`.
+    """B arms in motion.
 
     Attributes:
         q: joint angles (rad), (B, 7).
@@ -236,9 +280,34 @@ class Arms:
     @classmethod
     def at_rest(cls, count: int) -> Arms:
         """``count`` arms at rest in panda-gym's neutral pose."""
-        q = np.tile(NEUTRAL, (count, 1))
-        return cls(q, np.zeros((count, N)), hand_position(q), np.zeros((count, 3)))
+        zeros = np.zeros((count, N))
+        return cls(np.tile(NEUTRAL, (count, 1)), zeros, np.tile(START_HAND, (count, 1)), zeros[:, :3].copy())
 
-    def step(self, action: Array) -> None:
-        """One control step under ``action`` (B, 3), clipped to [−1, 1]."""
-        _step(self.q, self.speed, self.hand, self.velocity, np.asarray(action, dtype=np.float64))
+    def step(self, action: Array, sphere: Array) -> tuple[Arms, Array, NDArray[np.int64]]:
+        """One control step.
+
+        Args:
+            action: (B, 3), clipped to [−1, 1].
+            sphere: a moving sphere for each arm: centre (m), velocity (m/s), radius (m), (B, 7).
+
+        Returns:
+            The arms after the step, their least clearances within it (m), (B,), and the capsules that have them,
+            (B,), whose links are in :data:`rise_envs.panda_clearance.LINKS`.
+        """
+        count = len(self.q)
+        after = Arms(np.empty((count, N)), np.empty((count, N)), np.empty((count, 3)), np.empty((count, 3)))
+        clearance, nearest = np.empty(count), np.empty(count, np.int64)
+        _step(
+            self.q,
+            self.speed,
+            self.hand,
+            action,
+            sphere,
+            after.q,
+            after.speed,
+            after.hand,
+            after.velocity,
+            clearance,
+            nearest,
+        )
+        return after, clearance, nearest

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from rise_envs.panda_lanes import LANES, ONE, REAL, ZERO, Lanes, N, fixed
+from rise_envs.panda_lanes import LANES, ONE, REAL, ZERO, Lanes, N, compiled, fixed
 
 DT = 0.002  # s, a substep
 _SWEEPS = 5
@@ -37,7 +37,7 @@ def _write_pair(i: int, j: int, pair: int, inverse: Lanes, gains: Lanes) -> None
         gains[_LEFT + pair, m] = rho8 * rho8 * rho8
 
 
-@njit(cache=True, fastmath=True)
+@compiled
 def write_gains(inverse: Lanes, gains: Lanes) -> None:
     """What `motors` needs of the ``inverse`` (7, 7, L) of the mass matrix, (N_GAINS, L)."""
     inverse, gains = fixed(inverse, (N, N, LANES)), fixed(gains, (N_GAINS, LANES))
@@ -98,7 +98,7 @@ def _pull_pair(i: int, j: int, pair: int, first: bool, inverse: Lanes, gains: La
     _spread(i, _OTHER, inverse, s)
 
 
-@njit(cache=True, fastmath=True)
+@compiled
 def motors(inverse: Lanes, gains: Lanes, s: Lanes) -> None:
     """The motors in one substep: ``s`` holds what the joint velocities lack, and receives what they lack still."""
     inverse, gains = fixed(inverse, (N, N, LANES)), fixed(gains, (N_GAINS, LANES))
