@@ -186,13 +186,15 @@ def write_dynamics(twist: Lanes, body: Lanes, force: Lanes, matrix: Lanes, torqu
     """
     twist, body, force = fixed(twist, (N, 6, LANES)), fixed(body, (N, 15, LANES)), fixed(force, (12, LANES))
     matrix, torque = fixed(matrix, (N, N, LANES)), fixed(torque, (N, LANES))
+    for r in range(15):
+        for m in range(LANES):
+            total = body[N - 1, r, m]
+            for back in range(2, N + 1):
+                total += body[N - back, r, m]
+                body[N - back, r, m] = total
     mass = ZERO
     for j in range(N - 1, -1, -1):
         mass += _MASS[j]
-        if j < N - 1:
-            for r in range(15):
-                for m in range(LANES):
-                    body[j, r, m] += body[j + 1, r, m]
         for m in range(LANES):
             z0, z1, z2 = twist[j, 0, m], twist[j, 1, m], twist[j, 2, m]
             u0, u1, u2 = twist[j, 3, m], twist[j, 4, m], twist[j, 5, m]

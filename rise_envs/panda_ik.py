@@ -67,9 +67,11 @@ def _iterate(count: int, gram: Lanes, error: Lanes, total: Lanes) -> None:
     for i in range(6):
         for m in range(LANES):
             total[i, m] = ZERO
-    solution = np.empty((6, LANES), REAL)
+    solution = fixed(np.empty((6, LANES), REAL), (6, LANES))
     for _ in range(count):
-        solution[:] = error
+        for i in range(6):
+            for m in range(LANES):
+                solution[i, m] = error[i, m]
         solve(gram, solution)
         for m in range(LANES):
             gap = error[0, m] * error[0, m] + error[1, m] * error[1, m] + error[2, m] * error[2, m]

@@ -37,7 +37,7 @@ _SIN = np.array([1 / 6, 1 / 20, 1 / 42, 1 / 72], REAL)
 
 
 # Whoever adds a file of lanes adds it here: all are compiled anew when one of them changes.
-_FILES = ("kinematics", "lanes", "ik", "dynamics", "motors", "clearance", "motion")
+_FILES = ("kinematics", "lanes", "ik", "dynamics", "bounds", "motors", "clearance", "motion")
 _SOURCES = "".join(Path(__file__).with_name(f"panda_{name}.py").read_text() for name in _FILES)
 _DIGEST = hashlib.sha256(_SOURCES.encode()).hexdigest()[:12]
 
@@ -160,14 +160,12 @@ def write_gram(jacobian: Lanes, damping: float, gram: Lanes) -> None:
 def factor(matrix: Lanes) -> None:
     """Cholesky factors of positive definite matrices (6, 6, L), lower triangles, their diagonals inverted."""
     matrix = fixed(matrix, (6, 6, LANES))
-    for j in range(6):
-        for m in range(LANES):
+    for m in range(LANES):
+        for j in range(6):
             matrix[j, j, m] = ONE / np.sqrt(matrix[j, j, m])
-        for i in range(j + 1, 6):
-            for m in range(LANES):
+            for i in range(j + 1, 6):
                 matrix[i, j, m] *= matrix[j, j, m]
-            for k in range(j + 1, i + 1):
-                for m in range(LANES):
+                for k in range(j + 1, i + 1):
                     matrix[i, k, m] -= matrix[i, j, m] * matrix[k, j, m]
 
 

@@ -27,6 +27,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rise_envs.panda_bounds import (
+    N_BOUNDS,
+    meet_limits,
+    meet_table,
+    near_limits,
+    near_table,
+    sink,
+    write_effects,
+)
 from rise_envs.panda_clearance import look
 from rise_envs.panda_dynamics import write_bodies, write_dynamics
 from rise_envs.panda_ik import aim
@@ -82,6 +91,7 @@ class Block(NamedTuple):
     twist: Lanes  # (7, 6, L)
     torque: Lanes  # what holds the arm against gravity and its own motion, negative (N m), (7, L)
     free: Lanes  # joint accelerations without motors (rad/s²), (7, L)
+    bounds: Lanes  # scratch of `rise_envs.panda_bounds`, (N_BOUNDS, L)
     motors: Lanes  # scratch of `motors`, (N_SCRATCH, L)
     sphere: Lanes  # centre (m) and velocity (m/s) of the sphere where the step begins, (6, L)
     center: Lanes  # of the sphere now (m), (3, L)
@@ -118,6 +128,7 @@ def _make_block() -> Block:
         np.zeros((N, 6, LANES), REAL),
         np.zeros((N, LANES), REAL),
         np.zeros((N, LANES), REAL),
+        np.zeros((N_BOUNDS, LANES), REAL),
         np.zeros((N_SCRATCH, LANES), REAL),
         np.zeros((6, LANES), REAL),
         np.zeros((3, LANES), REAL),
@@ -198,12 +209,22 @@ def _move(w: Block) -> None:
     cos, sin = w.cos.copy(), w.sin.copy()
     _aim(w)
     w.cos[:], w.sin[:], w.change[:] = cos, sin, REAL(0)
+    low = narrow = False
     for substep in range(SUBSTEPS):
         if substep % _RENEW == 0:
             _renew(w)
             _look(w, substep)
+            write_hand(w.axes, w.origin, w.hand)
+            write_jacobian(w.axes, w.origin, w.hand, w.jacobian)
+            low, narrow = near_table(w.axes, w.hand, w.bounds), near_limits(w.q)
+            if low:
+                write_effects(w.inverse, w.jacobian, w.bounds)
         _write_lack(w)
-        motors(w.inverse, w.gains, w.motors)
+        if low:
+            meet_table(w.speed, w.bounds)
+        if narrow:
+            meet_limits(w.q, w.speed, w.bounds)
+        motors(w.inverse, w.gains, low, narrow, w.bounds, w.motors)
         if substep == SUBSTEPS - 1:  # the engine reports the hand where its last substep began
             turn(w.cos, w.sin, w.change)
             write_frames(w.cos, w.sin, w.axes, w.origin)
@@ -215,6 +236,8 @@ def _move(w: Block) -> None:
                 w.q[i, m] += _DT * w.speed[i, m]
                 change = _DT * w.speed[i, m]
                 w.change[i, m] = change if substep == SUBSTEPS - 1 else w.change[i, m] + change
+        if low:
+            sink(w.speed, w.bounds)
     turn(w.cos, w.sin, w.change)
     write_frames(w.cos, w.sin, w.axes, w.origin)
     _look(w, SUBSTEPS)

@@ -11,6 +11,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from rise_envs.panda_bounds import HELD, LACK, N_SCRATCH, TABLE, hold, press
+from rise_envs.panda_bounds import OTHER as _OTHER
+from rise_envs.panda_bounds import PUSH as _PUSH
 from rise_envs.panda_lanes import LANES, ONE, REAL, ZERO, Lanes, N, compiled, fixed
 
 DT = 0.002  # s, a substep
@@ -18,9 +21,8 @@ _SWEEPS = 5
 _IMPULSE = np.array([87.0, 87.0, 87.0, 87.0, 12.0, 120.0, 120.0])  # N m, panda-gym's torque limits
 _LIMIT = (DT * _IMPULSE).astype(REAL)
 
-# Rows of the scratch `s`: impulses, then what the joint velocities lack, then four more.
-LACK, _PUSH, _OTHER, _ANCHOR = N, 2 * N, 2 * N + 1, 2 * N + 2
-N_SCRATCH = 2 * N + 4
+# Rows of the scratch `s`: the motors' impulses come first; for the others see :mod:`rise_envs.panda_bounds`.
+_ANCHOR = 2 * N + 2
 # Rows of the gains: 1 / inverse[j, j], then for each pair 1 / determinant and what is left of a gap at the end.
 _DET, _LEFT = N, N + 2
 N_GAINS = N + 4
@@ -99,15 +101,32 @@ def _pull_pair(i: int, j: int, pair: int, first: bool, inverse: Lanes, gains: La
 
 
 @compiled
-def motors(inverse: Lanes, gains: Lanes, s: Lanes) -> None:
-    """The motors in one substep: ``s`` holds what the joint velocities lack, and receives what they lack still."""
+def motors(
+    inverse: Lanes, gains: Lanes, low: bool, narrow: bool, bounds: Lanes, s: Lanes
+) -> None:
+    """The motors, and what stops the arm, in one substep.
+
+    Args:
+        inverse: of the mass matrix, (7, 7, L).
+        gains: of `write_gains`, (N_GAINS, L).
+        low: whether an arm is near the table.
+        narrow: whether an arm is near a joint limit.
+        bounds: scratch of :mod:`rise_envs.panda_bounds`, (N_BOUNDS, L).
+        s: holds what the joint velocities lack, and receives what they lack still, (N_SCRATCH, L).
+    """
     inverse, gains = fixed(inverse, (N, N, LANES)), fixed(gains, (N_GAINS, LANES))
     s = fixed(s, (N_SCRATCH, LANES))
-    for i in range(N):
-        for m in range(LANES):
-            s[i, m] = ZERO
+    for m in range(LANES):
+        for i in range(N):
+            s[i, m], s[HELD + i, m] = ZERO, ZERO
+        for r in range(3):
+            s[TABLE + r, m] = ZERO
     for sweep in range(_SWEEPS):
         for j in range(6, 3, -1):
             _pull(j, inverse, gains, s)
         _pull_pair(1, 3, 0, sweep == 0, inverse, gains, s)
         _pull_pair(0, 2, 1, sweep == 0, inverse, gains, s)
+        if narrow:
+            hold(inverse, gains, bounds, s)
+        if low:
+            press(bounds, s)
