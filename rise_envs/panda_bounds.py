@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from rise_envs import panda_kinematics as panda
-from rise_envs.panda_lanes import LANES, ONE, REAL, ZERO, Lanes, N, compiled, fixed
+from rise_envs.panda_lanes import LANES, ONE, REAL, ZERO, Lanes, N, fixed, lane
 
 _DT = 0.002  # s, a substep
 _STIFFNESS, _DAMPING = 2 * 30_000.0, 2 * 1_000.0  # N/m and N s/m, of the URDF's two fingers
@@ -27,9 +27,10 @@ _TINY = REAL(1e-12)
 _CLOSE = REAL(0.03)  # m; nobody nears the table by more until the next look
 _NARROW = REAL(0.1)  # rad; no joint turns by more until then
 
-# Rows of `b`, which the sweeps only read. Of the directions x, y, z: the hand point's Jacobian (21), what an impulse does
-# to the joint velocities (21), 1 / what it does to its own direction, the velocity that the motors want; then the height
-# of the finger tips and the velocity that the table asks for; of the joints, what their velocities lack at the limits.
+# Rows of `b`, which the sweeps only read. Of the directions x, y, z: the hand point's Jacobian (21), what an impulse
+# does to the joint velocities (21), 1 / what it does to its own direction, the velocity that the motors want; then the
+# height of the finger tips, and the velocity that the table asks for; of the joints, what their velocities lack at the
+# limits.
 _JACOBIAN, _SPREAD, _GAIN, _WANTED, _HEIGHT, _ASKED, _LOWEST, _HIGHEST = 0, 21, 42, 45, 48, 49, 50, 57
 N_BOUNDS = 64
 # Rows of the motors' scratch `s`, which they write: what the joint velocities lack, pushes, and impulses so far.
@@ -38,7 +39,7 @@ TABLE, HELD = 2 * N + 4, 2 * N + 7
 N_SCRATCH = 3 * N + 7
 
 
-@compiled
+@lane
 def near_table(axes: Lanes, hand: Lanes, b: Lanes) -> bool:
     """Whether any hand is near the table; heights of the finger tips go into ``b`` (N_BOUNDS, L)."""
     axes, hand, b = fixed(axes, (N + 1, 3, 3, LANES)), fixed(hand, (3, LANES)), fixed(b, (N_BOUNDS, LANES))
@@ -50,7 +51,7 @@ def near_table(axes: Lanes, hand: Lanes, b: Lanes) -> bool:
     return lowest < _CLOSE
 
 
-@compiled
+@lane
 def near_limits(q: Lanes) -> bool:
     """Whether any joint angle of ``q`` (7, L) is near a limit."""
     q = fixed(q, (N, LANES))
@@ -62,7 +63,7 @@ def near_limits(q: Lanes) -> bool:
     return least < _NARROW
 
 
-@compiled
+@lane
 def write_effects(inverse: Lanes, jacobian: Lanes, b: Lanes) -> None:
     """What impulses at the hand point do, from the ``inverse`` of the mass matrix and the ``jacobian``."""
     inverse, jacobian = fixed(inverse, (N, N, LANES)), fixed(jacobian, (6, N, LANES))
@@ -85,7 +86,7 @@ def write_effects(inverse: Lanes, jacobian: Lanes, b: Lanes) -> None:
             b[_GAIN + r, m] = ONE / total
 
 
-@compiled
+@lane
 def meet_table(wanted: Lanes, b: Lanes) -> None:
     """Begin a substep at the table; ``wanted`` (7, L) are the joint velocities that the motors pull to."""
     wanted, b = fixed(wanted, (N, LANES)), fixed(b, (N_BOUNDS, LANES))
@@ -100,7 +101,7 @@ def meet_table(wanted: Lanes, b: Lanes) -> None:
         b[_ASKED, m] = -height * (_PER_DT if height > ZERO else _PUSH_OUT)
 
 
-@compiled
+@lane
 def meet_limits(q: Lanes, wanted: Lanes, b: Lanes) -> None:
     """Begin a substep at the joint limits; ``wanted`` (7, L) are the velocities that the motors pull to."""
     q, wanted, b = fixed(q, (N, LANES)), fixed(wanted, (N, LANES)), fixed(b, (N_BOUNDS, LANES))
@@ -111,7 +112,7 @@ def meet_limits(q: Lanes, wanted: Lanes, b: Lanes) -> None:
             b[_HIGHEST + i, m] = wanted[i, m] - (high - q[i, m]) * _PER_DT
 
 
-@compiled
+@lane
 def press(b: Lanes, s: Lanes) -> None:
     """Let the table push: one sweep over its normal and its friction."""
     b, s = fixed(b, (N_BOUNDS, LANES)), fixed(s, (N_SCRATCH, LANES))
@@ -141,7 +142,7 @@ def press(b: Lanes, s: Lanes) -> None:
             s[LACK + i, m] -= b[_SPREAD + i, m] * push + b[_SPREAD + N + i, m] * other
 
 
-@compiled
+@lane
 def hold(inverse: Lanes, gains: Lanes, b: Lanes, s: Lanes) -> None:
     """Let the joint limits push: one sweep. Row j of ``gains`` is 1 / inverse[j, j]."""
     inverse, gains = fixed(inverse, (N, N, LANES)), fixed(gains, (N, LANES))
@@ -159,7 +160,7 @@ def hold(inverse: Lanes, gains: Lanes, b: Lanes, s: Lanes) -> None:
                 s[LACK + i, m] -= inverse[j, i, m] * push
 
 
-@compiled
+@lane
 def sink(speed: Lanes, b: Lanes) -> None:
     """End a substep: the finger tips move on with the joint velocities ``speed`` (7, L)."""
     speed, b = fixed(speed, (N, LANES)), fixed(b, (N_BOUNDS, LANES))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from rise_envs import panda_kinematics as panda
-from rise_envs.panda_lanes import LANES, ONE, REAL, ZERO, Lanes, N, compiled, fixed
+from rise_envs.panda_lanes import LANES, ONE, REAL, ZERO, Lanes, N, fixed, lane
 
 _K = panda.N_CAPSULES
 
@@ -37,7 +37,7 @@ LINKS = np.array([*(f"panda_link{f}" for f in panda.CAPSULE_FRAME[: _K - 3]), *_
 """Names of the links that the capsules stand for, as the engine calls them, (K + 1,)."""
 
 
-@compiled
+@lane
 def look(axes: Lanes, origin: Lanes, center: Lanes, least: Lanes, nearest: Lanes) -> None:
     """Let ``least`` and ``nearest`` (L,) be those of the arms in this moment, where they come nearer than before.
 

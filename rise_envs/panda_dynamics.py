@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from rise_envs.panda_lanes import LANES, ONE, REAL, ZERO, Lanes, N, compiled, fixed
+from rise_envs.panda_lanes import LANES, ONE, REAL, ZERO, Lanes, N, fixed, lane
 
 Array = NDArray[np.float64]
 
@@ -69,7 +69,7 @@ def _inertias() -> tuple[Array, Array, Array]:
 _MASS, _CENTER, _INERTIA = (part.astype(REAL) for part in _inertias())
 
 
-@compiled
+@lane
 def write_bodies(axes: Lanes, origin: Lanes, speed: Lanes, spatial: Lanes, body: Lanes, twist: Lanes) -> None:
     """Inertias of the bodies and the forces that their motion at constant joint speeds takes, in place.
 
@@ -173,7 +173,7 @@ def write_bodies(axes: Lanes, origin: Lanes, speed: Lanes, spatial: Lanes, body:
             body[k, 12, m], body[k, 13, m], body[k, 14, m] = d0, d1, d2
 
 
-@compiled
+@lane
 def write_dynamics(twist: Lanes, body: Lanes, force: Lanes, matrix: Lanes, torque: Lanes) -> None:
     """Mass matrices (7, 7, L), lower triangle, and −bias torques (7, L): composite bodies, from the hand backwards.
 

@@ -17,9 +17,9 @@ from rise_envs.panda_lanes import (
     ZERO,
     Lanes,
     N,
-    compiled,
     factor,
     fixed,
+    lane,
     solve,
     turn,
     write_frames,
@@ -40,7 +40,7 @@ _ARC = np.array([1 / 6, 3 / 40, 15 / 336, 105 / 3456, 945 / 42240], REAL)
 _MIDDLE = REAL(0.5)
 
 
-@compiled
+@lane
 def write_error(axes: Lanes, hand: Lanes, target: Lanes, error: Lanes) -> None:
     """Position error (m) and rotation vector (rad) from the hand to its target, (6, L)."""
     axes, error = fixed(axes, (N + 1, 3, 3, LANES)), fixed(error, (6, LANES))
@@ -60,7 +60,7 @@ def write_error(axes: Lanes, hand: Lanes, target: Lanes, error: Lanes) -> None:
             error[r, m] = target[r, m] - hand[r, m]
 
 
-@compiled
+@lane
 def _iterate(count: int, gram: Lanes, error: Lanes, total: Lanes) -> None:
     """Sum of the solutions of ``count`` steps with the factored ``gram``; ``error`` is what they leave, (6, L)."""
     gram, error, total = fixed(gram, (6, 6, LANES)), fixed(error, (6, LANES)), fixed(total, (6, LANES))
@@ -81,7 +81,7 @@ def _iterate(count: int, gram: Lanes, error: Lanes, total: Lanes) -> None:
                 error[i, m] = _DAMPING * solution[i, m] if goes else error[i, m]
 
 
-@compiled
+@lane
 def _write_change(jacobian: Lanes, total: Lanes, change: Lanes) -> None:
     """Joint steps Jᵀ·total (7, L), shortened if a joint would turn too far."""
     jacobian, total = fixed(jacobian, (6, N, LANES)), fixed(total, (6, LANES))
@@ -99,7 +99,7 @@ def _write_change(jacobian: Lanes, total: Lanes, change: Lanes) -> None:
             change[k, m] *= shorter
 
 
-@compiled
+@lane
 def aim(
     cos: Lanes,
     sin: Lanes,

@@ -37,14 +37,23 @@ _SIN = np.array([1 / 6, 1 / 20, 1 / 42, 1 / 72], REAL)
 
 
 # Whoever adds a file of lanes adds it here: all are compiled anew when one of them changes.
-_FILES = ("kinematics", "lanes", "ik", "dynamics", "bounds", "motors", "clearance", "motion")
+_FILES = ("kinematics", "lanes", "ik", "dynamics", "bounds", "motors", "block", "clearance", "motion")
 _SOURCES = "".join(Path(__file__).with_name(f"panda_{name}.py").read_text() for name in _FILES)
 _DIGEST = hashlib.sha256(_SOURCES.encode()).hexdigest()[:12]
 
 
-def compiled(function: Callable) -> Any:
-    """``function``, compiled on its first call and kept on disk."""
-    # numba's cache watches the function's own file only; its name makes it watch what it is built on, too.
+def lane(function: Callable) -> Any:
+    """``function``, compiled where a compiled function calls it.
+
+    It is not kept on disk by itself: what comes from there cannot be optimised together with its caller, and what is
+    computed would depend, in the last bits, on what had been compiled before.
+    """
+    return njit(fastmath=True, forceinline=True)(function)
+
+
+def entrance(function: Callable) -> Any:
+    """``function``, compiled on its first call and kept on disk, together with all the lanes that it is built on."""
+    # numba's cache watches the function's own file only; its name makes it watch the others, too.
     function.__qualname__ += f"_{_DIGEST}"
     return njit(cache=True, fastmath=True)(function)
 
@@ -65,7 +74,7 @@ def fixed(array: Lanes, shape: tuple[int, ...]) -> Lanes:
     return carray(_pointer(array.ctypes.data), shape)  # type: ignore[call-arg]
 
 
-@compiled
+@lane
 def turn(cos: Lanes, sin: Lanes, angle: Lanes) -> None:
     """Turn cosines and sines (7, L) by ``angle`` (7, L), at most 1 rad, in place: no call to a sine."""
     cos, sin, angle = fixed(cos, (N, LANES)), fixed(sin, (N, LANES)), fixed(angle, (N, LANES))
@@ -80,7 +89,7 @@ def turn(cos: Lanes, sin: Lanes, angle: Lanes) -> None:
             sin[i, m] = sin[i, m] * c + x * t
 
 
-@compiled
+@lane
 def write_turns(angle: Lanes, cos: Lanes, sin: Lanes, part: Lanes) -> None:
     """Cosines and sines (7, L) of ``angle`` (7, L), at most 8 rad; ``part`` (7, L) is scratch."""
     cos, sin, angle = fixed(cos, (N, LANES)), fixed(sin, (N, LANES)), fixed(angle, (N, LANES))
@@ -97,7 +106,7 @@ def write_turns(angle: Lanes, cos: Lanes, sin: Lanes, part: Lanes) -> None:
                 cos[i, m], sin[i, m] = ONE - TWO * s * s, TWO * s * c
 
 
-@compiled
+@lane
 def write_frames(cos: Lanes, sin: Lanes, axes: Lanes, origin: Lanes) -> None:
     """Frames 0 to 7: axes as columns (8, 3, 3, L) and origins (8, 3, L), of which frame 0 is given."""
     cos, sin = fixed(cos, (N, LANES)), fixed(sin, (N, LANES))
@@ -116,7 +125,7 @@ def write_frames(cos: Lanes, sin: Lanes, axes: Lanes, origin: Lanes) -> None:
                 axes[i + 1, r, 2, m] = straight * z - turned * y
 
 
-@compiled
+@lane
 def write_hand(axes: Lanes, origin: Lanes, hand: Lanes) -> None:
     """The hand point (3, L)."""
     axes, origin = fixed(axes, (N + 1, 3, 3, LANES)), fixed(origin, (N + 1, 3, LANES))
@@ -126,7 +135,7 @@ def write_hand(axes: Lanes, origin: Lanes, hand: Lanes) -> None:
             hand[r, m] = origin[N, r, m] + HAND_POINT * axes[N, r, 2, m]
 
 
-@compiled
+@lane
 def write_jacobian(axes: Lanes, origin: Lanes, hand: Lanes, jacobian: Lanes) -> None:
     """Geometric Jacobian of the hand point, (6, 7, L)."""
     axes, origin = fixed(axes, (N + 1, 3, 3, LANES)), fixed(origin, (N + 1, 3, LANES))
@@ -142,7 +151,7 @@ def write_jacobian(axes: Lanes, origin: Lanes, hand: Lanes, jacobian: Lanes) -> 
             jacobian[3, i, m], jacobian[4, i, m], jacobian[5, i, m] = ax, ay, az
 
 
-@compiled
+@lane
 def write_gram(jacobian: Lanes, damping: float, gram: Lanes) -> None:
     """The lower triangle of JJᵀ + damping·I, (6, 6, L)."""
     jacobian, gram = fixed(jacobian, (6, N, LANES)), fixed(gram, (6, 6, LANES))
@@ -156,7 +165,7 @@ def write_gram(jacobian: Lanes, damping: float, gram: Lanes) -> None:
                 gram[i, j, m] = total
 
 
-@compiled
+@lane
 def factor(matrix: Lanes) -> None:
     """Cholesky factors of positive definite matrices (6, 6, L), lower triangles, their diagonals inverted."""
     matrix = fixed(matrix, (6, 6, LANES))
@@ -169,7 +178,7 @@ def factor(matrix: Lanes) -> None:
                     matrix[i, k, m] -= matrix[i, j, m] * matrix[k, j, m]
 
 
-@compiled
+@lane
 def solve(matrix: Lanes, x: Lanes) -> None:
     """Solve for six unknowns: ``x`` (6, L) becomes the solution, ``matrix`` (6, 6, L) is that of `factor`."""
     matrix, x = fixed(matrix, (6, 6, LANES)), fixed(x, (6, LANES))
@@ -186,7 +195,7 @@ def solve(matrix: Lanes, x: Lanes) -> None:
             x[j, m] = total * matrix[j, j, m]
 
 
-@compiled
+@lane
 def _sweep(p: int, matrix: Lanes, row: Lanes) -> None:
     """Sweep pivot ``p`` out of the lower triangles of symmetric matrices (7, 7, L); ``row`` (7, L) is scratch."""
     lanes = row.shape[-1]
@@ -208,14 +217,14 @@ def _sweep(p: int, matrix: Lanes, row: Lanes) -> None:
             matrix[a, b, m] = -row[p, m] if i == p else row[i, m] * row[p, m]
 
 
-@compiled
+@lane
 def invert(matrix: Lanes, row: Lanes) -> None:
     """The inverse of positive definite matrices (7, 7, L) given by their lower triangles.
 
     The sweep operator (Goodnight, "A tutorial on the SWEEP operator", The American Statistician 1979) keeps
     symmetric matrices symmetric and ends with the negative inverse. ``row`` (7, L) is scratch.
     """
-    for p in range(N):
+    for p in range(len(row)):  # N, but if the compiler knew, it would write the sweep out seven times
         _sweep(p, matrix, row)
     lanes = row.shape[-1]
     matrix = fixed(matrix, (N, N, LANES))

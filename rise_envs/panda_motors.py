@@ -14,7 +14,7 @@ from numba import njit
 from rise_envs.panda_bounds import HELD, LACK, N_SCRATCH, TABLE, hold, press
 from rise_envs.panda_bounds import OTHER as _OTHER
 from rise_envs.panda_bounds import PUSH as _PUSH
-from rise_envs.panda_lanes import LANES, ONE, REAL, ZERO, Lanes, N, compiled, fixed
+from rise_envs.panda_lanes import LANES, ONE, REAL, ZERO, Lanes, N, fixed, lane
 
 DT = 0.002  # s, a substep
 _SWEEPS = 5
@@ -39,7 +39,7 @@ def _write_pair(i: int, j: int, pair: int, inverse: Lanes, gains: Lanes) -> None
         gains[_LEFT + pair, m] = rho8 * rho8 * rho8
 
 
-@compiled
+@lane
 def write_gains(inverse: Lanes, gains: Lanes) -> None:
     """What `motors` needs of the ``inverse`` (7, 7, L) of the mass matrix, (N_GAINS, L)."""
     inverse, gains = fixed(inverse, (N, N, LANES)), fixed(gains, (N_GAINS, LANES))
@@ -100,10 +100,8 @@ def _pull_pair(i: int, j: int, pair: int, first: bool, inverse: Lanes, gains: La
     _spread(i, _OTHER, inverse, s)
 
 
-@compiled
-def motors(
-    inverse: Lanes, gains: Lanes, low: bool, narrow: bool, bounds: Lanes, s: Lanes
-) -> None:
+@lane
+def motors(inverse: Lanes, gains: Lanes, low: bool, narrow: bool, bounds: Lanes, s: Lanes) -> None:
     """The motors, and what stops the arm, in one substep.
 
     Args:
