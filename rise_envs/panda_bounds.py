@@ -48,7 +48,7 @@ def near_table(axes: Lanes, hand: Lanes, b: Lanes) -> bool:
         across = _HALF * abs(axes[N, 2, 0, m] - axes[N, 2, 1, m])
         b[_HEIGHT, m] = hand[2, m] + _TIP * axes[N, 2, 2, m] - _EDGE * across
         lowest = min(lowest, b[_HEIGHT, m])
-    return lowest < _CLOSE
+    return bool(lowest < _CLOSE)
 
 
 @lane
@@ -60,7 +60,7 @@ def near_limits(q: Lanes) -> bool:
         low, high = _LOW[i], _HIGH[i]
         for m in range(LANES):
             least = min(least, min(q[i, m] - low, high - q[i, m]))
-    return least < _NARROW
+    return bool(least < _NARROW)
 
 
 @lane

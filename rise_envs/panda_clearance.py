@@ -72,3 +72,12 @@ def look(axes: Lanes, origin: Lanes, center: Lanes, least: Lanes, nearest: Lanes
                 name = other if t > _HALF else number
                 nearest[m] = name if distance < least[m] else nearest[m]
                 least[m] = min(distance, least[m])
+
+
+@lane
+def write_center(sphere: Lanes, time: float, center: Lanes) -> None:
+    """Where the spheres (6, L) are ``time`` seconds after the beginning of the step, (3, L)."""
+    sphere, center = fixed(sphere, (6, LANES)), fixed(center, (3, LANES))
+    for r in range(3):
+        for m in range(LANES):
+            center[r, m] = sphere[r, m] + REAL(time) * sphere[3 + r, m]

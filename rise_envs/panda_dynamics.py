@@ -221,3 +221,15 @@ def write_dynamics(twist: Lanes, body: Lanes, force: Lanes, matrix: Lanes, torqu
             for r in range(6):
                 total -= twist[j, r, m] * body[j, 9 + r, m]
             torque[j, m] = total
+
+
+@lane
+def write_product(matrix: Lanes, x: Lanes, y: Lanes) -> None:
+    """Products ``y`` = matrix · x, (7, L)."""
+    matrix, x, y = fixed(matrix, (N, N, LANES)), fixed(x, (N, LANES)), fixed(y, (N, LANES))
+    for i in range(N):
+        for m in range(LANES):
+            total = matrix[i, 0, m] * x[0, m]
+            for j in range(1, N):
+                total += matrix[i, j, m] * x[j, m]
+            y[i, m] = total

@@ -75,6 +75,24 @@ def fixed(array: Lanes, shape: tuple[int, ...]) -> Lanes:
 
 
 @lane
+def copy(source: Lanes, target: Lanes) -> None:
+    """Copy (7, L)."""
+    source, target = fixed(source, (N, LANES)), fixed(target, (N, LANES))
+    for i in range(N):
+        for m in range(LANES):
+            target[i, m] = source[i, m]
+
+
+@lane
+def clear(x: Lanes) -> None:
+    """Make (7, L) zero."""
+    x = fixed(x, (N, LANES))
+    for i in range(N):
+        for m in range(LANES):
+            x[i, m] = ZERO
+
+
+@lane
 def turn(cos: Lanes, sin: Lanes, angle: Lanes) -> None:
     """Turn cosines and sines (7, L) by ``angle`` (7, L), at most 1 rad, in place: no call to a sine."""
     cos, sin, angle = fixed(cos, (N, LANES)), fixed(sin, (N, LANES)), fixed(angle, (N, LANES))

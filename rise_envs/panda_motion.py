@@ -33,8 +33,6 @@ from numpy.typing import NDArray
 
 from rise_envs.panda_block import Block, block
 from rise_envs.panda_bounds import (
-    LACK,
-    N_SCRATCH,
     meet_limits,
     meet_table,
     near_limits,
@@ -42,27 +40,25 @@ from rise_envs.panda_bounds import (
     sink,
     write_effects,
 )
-from rise_envs.panda_clearance import look
-from rise_envs.panda_dynamics import write_bodies, write_dynamics
+from rise_envs.panda_clearance import look, write_center
+from rise_envs.panda_dynamics import write_bodies, write_dynamics, write_product
 from rise_envs.panda_ik import aim
 from rise_envs.panda_kinematics import NEUTRAL
 from rise_envs.panda_lanes import (
     LANES,
-    REAL,
     ZERO,
-    Lanes,
     N,
+    clear,
+    copy,
     entrance,
-    fixed,
     invert,
-    lane,
     turn,
     write_frames,
     write_hand,
     write_jacobian,
     write_turns,
 )
-from rise_envs.panda_motors import DT, motors, write_gains
+from rise_envs.panda_motors import DT, go, motors, write_gains, write_lack
 from rise_envs.panda_scene import START_HAND
 
 Array = NDArray[np.float64]
@@ -70,70 +66,6 @@ Array = NDArray[np.float64]
 STEP = 0.05  # m of displacement per unit of action
 SUBSTEPS = 20
 _RENEW = 4  # substeps between two mass matrices
-_DT, _GAIN = REAL(DT), REAL(0.1 / DT)
-
-
-@lane
-def _write_product(matrix: Lanes, x: Lanes, y: Lanes) -> None:
-    """Products ``y`` = matrix · x, (7, L)."""
-    matrix, x, y = fixed(matrix, (N, N, LANES)), fixed(x, (N, LANES)), fixed(y, (N, LANES))
-    for i in range(N):
-        for m in range(LANES):
-            total = matrix[i, 0, m] * x[0, m]
-            for j in range(1, N):
-                total += matrix[i, j, m] * x[j, m]
-            y[i, m] = total
-
-
-@lane
-def _copy(source: Lanes, target: Lanes) -> None:
-    """Copy (7, L)."""
-    source, target = fixed(source, (N, LANES)), fixed(target, (N, LANES))
-    for i in range(N):
-        for m in range(LANES):
-            target[i, m] = source[i, m]
-
-
-@lane
-def _clear(x: Lanes) -> None:
-    """Make (7, L) zero."""
-    x = fixed(x, (N, LANES))
-    for i in range(N):
-        for m in range(LANES):
-            x[i, m] = ZERO
-
-
-@lane
-def _write_center(sphere: Lanes, time: float, center: Lanes) -> None:
-    """Where the spheres (6, L) are ``time`` seconds after the beginning of the step, (3, L)."""
-    sphere, center = fixed(sphere, (6, LANES)), fixed(center, (3, LANES))
-    for r in range(3):
-        for m in range(LANES):
-            center[r, m] = sphere[r, m] + REAL(time) * sphere[3 + r, m]
-
-
-@lane
-def _write_lack(aim: Lanes, q: Lanes, free: Lanes, speed: Lanes, s: Lanes) -> None:
-    """What the joint velocities lack before the motors act; ``speed`` receives what the motors pull to."""
-    aim, q, free = fixed(aim, (N, LANES)), fixed(q, (N, LANES)), fixed(free, (N, LANES))
-    speed, s = fixed(speed, (N, LANES)), fixed(s, (N_SCRATCH, LANES))
-    for i in range(N):
-        for m in range(LANES):
-            wanted = _GAIN * (aim[i, m] - q[i, m])
-            s[LACK + i, m] = wanted - speed[i, m] - _DT * free[i, m]
-            speed[i, m] = wanted
-
-
-@lane
-def _go(s: Lanes, speed: Lanes, q: Lanes, change: Lanes) -> None:
-    """End a substep: what was wanted less what it still lacks is the speed, and the joints turn."""
-    s, speed = fixed(s, (N_SCRATCH, LANES)), fixed(speed, (N, LANES))
-    q, change = fixed(q, (N, LANES)), fixed(change, (N, LANES))
-    for i in range(N):
-        for m in range(LANES):
-            speed[i, m] -= s[LACK + i, m]
-            q[i, m] += _DT * speed[i, m]
-            change[i, m] += _DT * speed[i, m]
 
 
 # What follows puts the pieces together. It is written into `_step`, the only function of all that numba sees whole.
@@ -143,9 +75,9 @@ def _go(s: Lanes, speed: Lanes, q: Lanes, change: Lanes) -> None:
 def _aim(w: Block) -> None:
     """Cosines and sines, and Bullet's joint angles ``aim`` for the hand's targets."""
     write_turns(w.q, w.cos, w.sin, w.change)
-    _copy(w.q, w.aim)
-    _copy(w.cos, w.aim_cos)
-    _copy(w.sin, w.aim_sin)
+    copy(w.q, w.aim)
+    copy(w.cos, w.aim_cos)
+    copy(w.sin, w.aim_sin)
     aim(
         w.aim_cos,
         w.aim_sin,
@@ -160,14 +92,14 @@ def _aim(w: Block) -> None:
         w.change,
         w.aim,
     )
-    _clear(w.change)
+    clear(w.change)
 
 
 @njit(inline="always")
 def _turn(w: Block) -> None:
-    """Frames, hand point and Jacobian at the present angles."""
+    """Frames at the present angles."""
     turn(w.cos, w.sin, w.change)
-    _clear(w.change)
+    clear(w.change)
     write_frames(w.cos, w.sin, w.axes, w.origin)
 
 
@@ -178,13 +110,13 @@ def _renew(w: Block) -> None:
     write_dynamics(w.twist, w.body, w.spatial, w.inverse, w.torque)
     invert(w.inverse, w.free)
     write_gains(w.inverse, w.gains)
-    _write_product(w.inverse, w.torque, w.free)
+    write_product(w.inverse, w.torque, w.free)
 
 
 @njit(inline="always")
 def _look(w: Block, substep: int) -> None:
     """Compare the arms, whose frames are those at the beginning of ``substep``, with their spheres."""
-    _write_center(w.sphere, DT * substep, w.center)
+    write_center(w.sphere, DT * substep, w.center)
     look(w.axes, w.origin, w.center, w.least, w.nearest)
 
 
@@ -205,13 +137,13 @@ def _move(w: Block) -> None:
             low, narrow = near_table(w.axes, w.hand, w.bounds), near_limits(w.q)
             if low:
                 write_effects(w.inverse, w.jacobian, w.bounds)
-        _write_lack(w.aim, w.q, w.free, w.speed, w.motors)
+        write_lack(w.aim, w.q, w.free, w.speed, w.motors)
         if low:
             meet_table(w.speed, w.bounds)
         if narrow:
             meet_limits(w.q, w.speed, w.bounds)
         motors(w.inverse, w.gains, low, narrow, w.bounds, w.motors)
-        _go(w.motors, w.speed, w.q, w.change)
+        go(w.motors, w.speed, w.q, w.change)
         if low:
             sink(w.speed, w.bounds)
     _turn(w)

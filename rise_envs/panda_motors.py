@@ -18,6 +18,7 @@ from rise_envs.panda_lanes import LANES, ONE, REAL, ZERO, Lanes, N, fixed, lane
 
 DT = 0.002  # s, a substep
 _SWEEPS = 5
+_DT, _GAIN = REAL(DT), REAL(0.1 / DT)
 _IMPULSE = np.array([87.0, 87.0, 87.0, 87.0, 12.0, 120.0, 120.0])  # N m, panda-gym's torque limits
 _LIMIT = (DT * _IMPULSE).astype(REAL)
 
@@ -128,3 +129,27 @@ def motors(inverse: Lanes, gains: Lanes, low: bool, narrow: bool, bounds: Lanes,
             hold(inverse, gains, bounds, s)
         if low:
             press(bounds, s)
+
+
+@lane
+def write_lack(aim: Lanes, q: Lanes, free: Lanes, speed: Lanes, s: Lanes) -> None:
+    """What the joint velocities lack before the motors act; ``speed`` receives what the motors pull to."""
+    aim, q, free = fixed(aim, (N, LANES)), fixed(q, (N, LANES)), fixed(free, (N, LANES))
+    speed, s = fixed(speed, (N, LANES)), fixed(s, (N_SCRATCH, LANES))
+    for i in range(N):
+        for m in range(LANES):
+            wanted = _GAIN * (aim[i, m] - q[i, m])
+            s[LACK + i, m] = wanted - speed[i, m] - _DT * free[i, m]
+            speed[i, m] = wanted
+
+
+@lane
+def go(s: Lanes, speed: Lanes, q: Lanes, change: Lanes) -> None:
+    """End a substep: what was wanted less what it still lacks is the speed, and the joints turn."""
+    s, speed = fixed(s, (N_SCRATCH, LANES)), fixed(speed, (N, LANES))
+    q, change = fixed(q, (N, LANES)), fixed(change, (N, LANES))
+    for i in range(N):
+        for m in range(LANES):
+            speed[i, m] -= s[LACK + i, m]
+            q[i, m] += _DT * speed[i, m]
+            change[i, m] += _DT * speed[i, m]

@@ -6,6 +6,7 @@ import sys
 import time
 import warnings
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,11 @@ def parser() -> Parser:
     return p
 
 
+def _tell(tell: Any, share: float) -> None:
+    """Say how much is done, without figures."""
+    tell(share, {})
+
+
 def measure_all(episodes: int, quick: bool) -> tuple[list[Any], dict[str, Any]]:
     """All rows of ``fidelity.csv``, and the paths that the figure shows."""
     from benchmarks.display import Display
@@ -61,7 +67,7 @@ def measure_all(episodes: int, quick: bool) -> tuple[list[Any], dict[str, Any]]:
     with Display() as display:
         for name, measured in kinds.items():
             with display.step(f"actions {page.TITLES[name]}") as tell:
-                paths[name] = measured(lambda share, tell=tell: tell(share, {}))
+                paths[name] = measured(partial(_tell, tell))
                 rows += page.path_rows(name, paths[name])
         for name in ("cbf", "mpc", "pcbc", "rise"):
             expert = name in kinds
@@ -69,15 +75,13 @@ def measure_all(episodes: int, quick: bool) -> tuple[list[Any], dict[str, Any]]:
                 policy = measure.make_expert(name, measure.BULLET)
             else:
                 with display.step(f"train {name}") as tell:
-                    policy = measure.trained(name, demos, updates, lambda share, tell=tell: tell(share, {}))
+                    policy = measure.trained(name, demos, updates, partial(_tell, tell))
             # A step of the MPC expert takes ten times as long as one of the engine.
             scenarios = max(3, episodes // 5) if name == "mpc" else episodes
             label = f"expert-{name}" if expert else name
             for level in _LEVELS:
                 with display.step(f"{label} at noise {level:g}, in both") as tell:
-                    loops = measure.closed_loop(
-                        policy, level, scenarios, lambda share, tell=tell: tell(share, {})
-                    )
+                    loops = measure.closed_loop(policy, level, scenarios, partial(_tell, tell))
                 rows += page.loop_rows(label, level, loops)
     return rows, paths
 
