@@ -35,6 +35,11 @@ ENVS: dict[str, tuple[str, str | None, int]] = {
         200,
     ),
     "RISE-SafePanda-v0": ("rise_envs.safe_panda:SafePandaEnv", None, 50),
+    "RISE-SafePandaKinematic-v0": (
+        "rise_envs.safe_panda_kinematic:SafePandaKinematicEnv",
+        "rise_envs.safe_panda_kinematic_vector:SafePandaKinematicVectorEnv",
+        50,
+    ),
 }
 
 # id -> the environment that it models. To train on; results are reported from the one that is modelled.

@@ -10,7 +10,8 @@ Shapes: B batch, K capsules. SI units, world frame. Functions marked *in place* 
 caller owns, so that searches over thousands of poses allocate nothing.
 
 numba's cache watches each compiled function's own file only: after an edit here, delete the ``__pycache__``
-folders of this package and of ``rise_agents.experts``, which compiled these functions into theirs.
+folder of ``rise_agents.experts``, which compiled these functions into theirs. (The batched arms of
+:mod:`rise_envs.panda_lanes` watch this file.)
 """
 
 from __future__ import annotations

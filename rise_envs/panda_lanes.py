@@ -1,85 +1,61 @@
-"""Rigid-body dynamics of many Panda arms at once, one per vector lane, compiled with numba.
+"""Kinematics and linear algebra of many Panda arms at once, one per vector lane, compiled with numba.
 
 Arrays have L = ``LANES`` arms in their last axis and every innermost loop runs over it, so that the compiler can
 step several arms with one instruction. It does so only if it knows the distance between two rows: `fixed` tells
-it the shapes. All functions work in place. SI units, world frame; base, joints and frames as in
-:mod:`rise_envs.panda_kinematics`.
+it the shapes. Numbers are ``REAL``, single precision: twice as many fit into one instruction, and the arm's motion
+is not known to a ten-thousandth of a millimetre anyway. Constants in compiled code must be of that type, too, or
+numba goes on in double precision. All functions work in place. SI units, world frame; base, joints and frames as
+in :mod:`rise_envs.panda_kinematics`.
 """
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numba import carray, njit, types
+from numba import carray, from_dtype, njit, types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from rise_envs.panda_kinematics import ORIGIN, TWIST
+from rise_envs import panda_kinematics as panda
 
-Array = NDArray[np.float64]
+REAL = np.float32
+Lanes = NDArray[np.float32]
 
 LANES = 32
 N = 7  # joints
-HAND_POINT = 0.107 + 0.105  # m along z of frame 7
-_DAMPING = 0.04  # Bullet's, of every body
-_GRAVITY = 9.81
-_HALF = np.sqrt(0.5)
+ZERO, ONE, TWO = REAL(0.0), REAL(1.0), REAL(2.0)
+HAND_POINT = REAL(0.107 + 0.105)  # m along z of frame 7
+_ORIGIN, _TWIST = panda.ORIGIN.astype(REAL), panda.TWIST.astype(REAL)
+_HALVINGS = 3
+# Factors of the power series of cosine and sine.
+_COS = np.array([1 / 2, 1 / 12, 1 / 30, 1 / 56], REAL)
+_SIN = np.array([1 / 6, 1 / 20, 1 / 42, 1 / 72], REAL)
 
 
-def _inertias() -> tuple[Array, Array, Array]:
-    """Masses (7,), centres of mass (7, 3) and inertias about them (7, 3, 3) of the moving bodies, in their frames.
+# Whoever adds a file of lanes adds it here: all are compiled anew when one of them changes.
+_FILES = ("kinematics", "lanes", "ik", "dynamics", "bounds", "motors", "block", "clearance", "motion")
+_SOURCES = "".join(Path(__file__).with_name(f"panda_{name}.py").read_text() for name in _FILES)
+_DIGEST = hashlib.sha256(_SOURCES.encode()).hexdigest()[:12]
 
-    Masses and centres are the URDF's; Bullet computes the inertias from the collision shapes. Hand and fingers
-    belong to body 7.
+
+def lane(function: Callable) -> Any:
+    """``function``, compiled where a compiled function calls it.
+
+    It is not kept on disk by itself: what comes from there cannot be optimised together with its caller, and what is
+    computed would depend, in the last bits, on what had been compiled before.
     """
-    mass = np.array([2.7, 2.73, 2.04, 2.08, 3.0, 1.3, 0.2])
-    center = np.array(
-        [
-            [0.0, -0.04, -0.05],
-            [0.0, -0.04, 0.06],
-            [0.01, 0.01, -0.05],
-            [-0.03, 0.03, 0.02],
-            [0.0, 0.04, -0.12],
-            [0.04, 0.0, 0.0],
-            [0.0, 0.0, 0.08],
-        ]
-    )
-    diagonal = np.array(
-        [
-            [0.022971310, 0.017768771, 0.011484088],
-            [0.023490852, 0.011612936, 0.018228195],
-            [0.010920469, 0.012580505, 0.011968103],
-            [0.011335035, 0.012248637, 0.013056772],
-            [0.035676471, 0.029848038, 0.012802225],
-            [0.003427982, 0.005116922, 0.005987757],
-            [0.000361607, 0.000362157, 0.000592108],
-        ]
-    )
-    inertia = diagonal[:, :, None] * np.eye(3)
-    hand_axes = np.array([[_HALF, _HALF, 0.0], [-_HALF, _HALF, 0.0], [0.0, 0.0, 1.0]])  # in frame 7
-    finger = np.array([4.168136569e-5, 3.873779772e-5, 1.693540219e-5])
-    parts = [
-        (0.2, center[6].copy(), inertia[6].copy()),
-        (
-            0.81,
-            np.array([0.0, 0.0, 0.147]),
-            hand_axes @ np.diag([0.003719113, 0.001016160, 0.003388322]) @ hand_axes.T,
-        ),
-    ]
-    for side in (0.01, -0.01):
-        at = np.array([0.0, 0.0, 0.107]) + hand_axes @ np.array([0.0, side, 0.0784])
-        parts.append((0.1, at, hand_axes @ np.diag(finger) @ hand_axes.T))
-    mass[6] = sum(part[0] for part in parts)
-    center[6] = sum(part[0] * part[1] for part in parts) / mass[6]
-    inertia[6] = 0.0
-    for weight, at, own in parts:
-        off = at - center[6]
-        inertia[6] += own + weight * (off @ off * np.eye(3) - np.outer(off, off))
-    return mass, center, inertia
+    return njit(fastmath=True, forceinline=True)(function)
 
 
-_MASS, _CENTER, _INERTIA = _inertias()
+def entrance(function: Callable) -> Any:
+    """``function``, compiled on its first call and kept on disk, together with all the lanes that it is built on."""
+    # numba's cache watches the function's own file only; its name makes it watch the others, too.
+    function.__qualname__ += f"_{_DIGEST}"
+    return njit(cache=True, fastmath=True)(function)
 
 
 @intrinsic
@@ -89,41 +65,74 @@ def _pointer(context: Any, address: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.inttoptr(arguments[0], context.get_value_type(signature.return_type))
 
-    return types.CPointer(types.float64)(types.intp), generate
+    return types.CPointer(from_dtype(np.dtype(REAL)))(types.intp), generate
 
 
 @njit(inline="always")
-def fixed(array: Array, shape: tuple[int, ...]) -> Array:
+def fixed(array: Lanes, shape: tuple[int, ...]) -> Lanes:
     """The same contiguous array with a shape that the compiler knows; it must be the array's own."""
     return carray(_pointer(array.ctypes.data), shape)  # type: ignore[call-arg]
 
 
-@njit(cache=True, fastmath=True)
-def turn(cos: Array, sin: Array, angle: Array) -> None:
-    """Turn cosines and sines (7, L) by ``angle`` (7, L), below 0.6 rad, in place: no call to a sine."""
-    lanes = cos.shape[-1]
+@lane
+def copy(source: Lanes, target: Lanes) -> None:
+    """Copy (7, L)."""
+    source, target = fixed(source, (N, LANES)), fixed(target, (N, LANES))
+    for i in range(N):
+        for m in range(LANES):
+            target[i, m] = source[i, m]
+
+
+@lane
+def clear(x: Lanes) -> None:
+    """Make (7, L) zero."""
+    x = fixed(x, (N, LANES))
+    for i in range(N):
+        for m in range(LANES):
+            x[i, m] = ZERO
+
+
+@lane
+def turn(cos: Lanes, sin: Lanes, angle: Lanes) -> None:
+    """Turn cosines and sines (7, L) by ``angle`` (7, L), at most 1 rad, in place: no call to a sine."""
     cos, sin, angle = fixed(cos, (N, LANES)), fixed(sin, (N, LANES)), fixed(angle, (N, LANES))
     for i in range(N):
-        for m in range(lanes):
+        for m in range(LANES):
             d = angle[i, m]
             s = d * d
-            c = 1.0 - s / 2 * (1.0 - s / 12 * (1.0 - s / 30 * (1.0 - s / 56 * (1.0 - s / 90))))
-            t = d * (1.0 - s / 6 * (1.0 - s / 20 * (1.0 - s / 42 * (1.0 - s / 72 * (1.0 - s / 110)))))
+            c = ONE - s * _COS[0] * (ONE - s * _COS[1] * (ONE - s * _COS[2] * (ONE - s * _COS[3])))
+            t = d * (ONE - s * _SIN[0] * (ONE - s * _SIN[1] * (ONE - s * _SIN[2] * (ONE - s * _SIN[3]))))
             x = cos[i, m]
             cos[i, m] = x * c - sin[i, m] * t
             sin[i, m] = sin[i, m] * c + x * t
 
 
-@njit(cache=True, fastmath=True)
-def write_frames(cos: Array, sin: Array, axes: Array, origin: Array) -> None:
+@lane
+def write_turns(angle: Lanes, cos: Lanes, sin: Lanes, part: Lanes) -> None:
+    """Cosines and sines (7, L) of ``angle`` (7, L), at most 8 rad; ``part`` (7, L) is scratch."""
+    cos, sin, angle = fixed(cos, (N, LANES)), fixed(sin, (N, LANES)), fixed(angle, (N, LANES))
+    share = ONE / REAL(2**_HALVINGS)
+    for i in range(N):
+        for m in range(LANES):
+            part[i, m] = angle[i, m] * share
+            cos[i, m], sin[i, m] = ONE, ZERO
+    turn(cos, sin, part)
+    for _ in range(_HALVINGS):
+        for i in range(N):
+            for m in range(LANES):
+                c, s = cos[i, m], sin[i, m]
+                cos[i, m], sin[i, m] = ONE - TWO * s * s, TWO * s * c
+
+
+@lane
+def write_frames(cos: Lanes, sin: Lanes, axes: Lanes, origin: Lanes) -> None:
     """Frames 0 to 7: axes as columns (8, 3, 3, L) and origins (8, 3, L), of which frame 0 is given."""
-    lanes = cos.shape[-1]
     cos, sin = fixed(cos, (N, LANES)), fixed(sin, (N, LANES))
     axes, origin = fixed(axes, (N + 1, 3, 3, LANES)), fixed(origin, (N + 1, 3, LANES))
     for i in range(N):
-        ox, oy, oz, twist = ORIGIN[i, 0], ORIGIN[i, 1], ORIGIN[i, 2], TWIST[i]
-        straight, turned = 1.0 - twist * twist, twist
-        for m in range(lanes):
+        ox, oy, oz, twist = _ORIGIN[i, 0], _ORIGIN[i, 1], _ORIGIN[i, 2], _TWIST[i]
+        straight, turned = ONE - twist * twist, twist
+        for m in range(LANES):
             c, s = cos[i, m], sin[i, m]
             for r in range(3):
                 x, y, z = axes[i, r, 0, m], axes[i, r, 1, m], axes[i, r, 2, m]
@@ -134,22 +143,23 @@ def write_frames(cos: Array, sin: Array, axes: Array, origin: Array) -> None:
                 axes[i + 1, r, 2, m] = straight * z - turned * y
 
 
-@njit(cache=True, fastmath=True)
-def write_hand(axes: Array, origin: Array, hand: Array) -> None:
+@lane
+def write_hand(axes: Lanes, origin: Lanes, hand: Lanes) -> None:
     """The hand point (3, L)."""
+    axes, origin = fixed(axes, (N + 1, 3, 3, LANES)), fixed(origin, (N + 1, 3, LANES))
+    hand = fixed(hand, (3, LANES))
     for r in range(3):
-        for m in range(hand.shape[-1]):
+        for m in range(LANES):
             hand[r, m] = origin[N, r, m] + HAND_POINT * axes[N, r, 2, m]
 
 
-@njit(cache=True, fastmath=True)
-def write_jacobian(axes: Array, origin: Array, hand: Array, jacobian: Array) -> None:
+@lane
+def write_jacobian(axes: Lanes, origin: Lanes, hand: Lanes, jacobian: Lanes) -> None:
     """Geometric Jacobian of the hand point, (6, 7, L)."""
-    lanes = hand.shape[-1]
     axes, origin = fixed(axes, (N + 1, 3, 3, LANES)), fixed(origin, (N + 1, 3, LANES))
     hand, jacobian = fixed(hand, (3, LANES)), fixed(jacobian, (6, N, LANES))
     for i in range(N):
-        for m in range(lanes):
+        for m in range(LANES):
             ax, ay, az = axes[i + 1, 0, 2, m], axes[i + 1, 1, 2, m], axes[i + 1, 2, 2, m]
             dx, dy = hand[0, m] - origin[i + 1, 0, m], hand[1, m] - origin[i + 1, 1, m]
             dz = hand[2, m] - origin[i + 1, 2, m]
@@ -159,59 +169,52 @@ def write_jacobian(axes: Array, origin: Array, hand: Array, jacobian: Array) -> 
             jacobian[3, i, m], jacobian[4, i, m], jacobian[5, i, m] = ax, ay, az
 
 
-@njit(cache=True, fastmath=True)
-def write_gram(jacobian: Array, damping: float, gram: Array) -> None:
+@lane
+def write_gram(jacobian: Lanes, damping: float, gram: Lanes) -> None:
     """The lower triangle of JJᵀ + damping·I, (6, 6, L)."""
-    lanes = gram.shape[-1]
     jacobian, gram = fixed(jacobian, (6, N, LANES)), fixed(gram, (6, 6, LANES))
     for i in range(6):
         for j in range(i + 1):
-            start = damping if i == j else 0.0
-            for m in range(lanes):
+            start = REAL(damping) if i == j else ZERO
+            for m in range(LANES):
                 total = start
                 for k in range(N):
                     total += jacobian[i, k, m] * jacobian[j, k, m]
                 gram[i, j, m] = total
 
 
-@njit(cache=True, fastmath=True)
-def _eliminate(j: int, matrix: Array, x: Array) -> None:
-    """Column ``j`` of the Cholesky factors, and forward substitution with it."""
-    lanes = x.shape[-1]
+@lane
+def factor(matrix: Lanes) -> None:
+    """Cholesky factors of positive definite matrices (6, 6, L), lower triangles, their diagonals inverted."""
+    matrix = fixed(matrix, (6, 6, LANES))
+    for m in range(LANES):
+        for j in range(6):
+            matrix[j, j, m] = ONE / np.sqrt(matrix[j, j, m])
+            for i in range(j + 1, 6):
+                matrix[i, j, m] *= matrix[j, j, m]
+                for k in range(j + 1, i + 1):
+                    matrix[i, k, m] -= matrix[i, j, m] * matrix[k, j, m]
+
+
+@lane
+def solve(matrix: Lanes, x: Lanes) -> None:
+    """Solve for six unknowns: ``x`` (6, L) becomes the solution, ``matrix`` (6, 6, L) is that of `factor`."""
     matrix, x = fixed(matrix, (6, 6, LANES)), fixed(x, (6, LANES))
-    for m in range(lanes):
-        matrix[j, j, m] = 1.0 / np.sqrt(matrix[j, j, m])
-        x[j, m] *= matrix[j, j, m]
-    for i in range(j + 1, 6):
-        for m in range(lanes):
-            matrix[i, j, m] *= matrix[j, j, m]
-            x[i, m] -= matrix[i, j, m] * x[j, m]
-        for k in range(j + 1, i + 1):
-            for m in range(lanes):
-                matrix[i, k, m] -= matrix[i, j, m] * matrix[k, j, m]
+    for m in range(LANES):
+        for j in range(6):
+            total = x[j, m]
+            for i in range(j):
+                total -= matrix[j, i, m] * x[i, m]
+            x[j, m] = total * matrix[j, j, m]
+        for j in range(5, -1, -1):
+            total = x[j, m]
+            for i in range(j + 1, 6):
+                total -= matrix[i, j, m] * x[i, m]
+            x[j, m] = total * matrix[j, j, m]
 
 
-@njit(cache=True, fastmath=True)
-def solve(matrix: Array, x: Array) -> None:
-    """Solve matrix · y = x for six unknowns: ``x`` (6, L) receives y.
-
-    The matrices (6, 6, L) are positive definite; their lower triangles receive the Cholesky factors, the
-    diagonals inverted.
-    """
-    lanes = x.shape[-1]
-    matrix, x = fixed(matrix, (6, 6, LANES)), fixed(x, (6, LANES))
-    for j in range(6):
-        _eliminate(j, matrix, x)
-    for j in range(5, -1, -1):
-        for m in range(lanes):
-            x[j, m] *= matrix[j, j, m]
-        for i in range(j):
-            for m in range(lanes):
-                x[i, m] -= matrix[j, i, m] * x[j, m]
-
-
-@njit(cache=True, fastmath=True)
-def _sweep(p: int, matrix: Array, row: Array) -> None:
+@lane
+def _sweep(p: int, matrix: Lanes, row: Lanes) -> None:
     """Sweep pivot ``p`` out of the lower triangles of symmetric matrices (7, 7, L); ``row`` (7, L) is scratch."""
     lanes = row.shape[-1]
     matrix, row = fixed(matrix, (N, N, LANES)), fixed(row, (N, LANES))
@@ -220,7 +223,7 @@ def _sweep(p: int, matrix: Array, row: Array) -> None:
         for m in range(lanes):
             row[i, m] = matrix[a, b, m]
     for m in range(lanes):
-        row[p, m] = 1.0 / row[p, m]
+        row[p, m] = ONE / row[p, m]
     for i in range(N):
         for j in range(i + 1):
             if i != p and j != p:
@@ -232,171 +235,19 @@ def _sweep(p: int, matrix: Array, row: Array) -> None:
             matrix[a, b, m] = -row[p, m] if i == p else row[i, m] * row[p, m]
 
 
-@njit(cache=True, fastmath=True)
-def invert(matrix: Array, row: Array) -> None:
+@lane
+def invert(matrix: Lanes, row: Lanes) -> None:
     """The inverse of positive definite matrices (7, 7, L) given by their lower triangles.
 
     The sweep operator (Goodnight, "A tutorial on the SWEEP operator", The American Statistician 1979) keeps
     symmetric matrices symmetric and ends with the negative inverse. ``row`` (7, L) is scratch.
     """
-    for p in range(N):
+    for p in range(len(row)):  # N, but if the compiler knew, it would write the sweep out seven times
         _sweep(p, matrix, row)
+    lanes = row.shape[-1]
+    matrix = fixed(matrix, (N, N, LANES))
     for i in range(N):
         for j in range(i + 1):
-            for m in range(LANES):
+            for m in range(lanes):
                 matrix[i, j, m] = -matrix[i, j, m]
                 matrix[j, i, m] = matrix[i, j, m]
-
-
-@njit(cache=True, fastmath=True)
-def write_bodies(axes: Array, origin: Array, speed: Array, spatial: Array, body: Array, twist: Array) -> None:
-    """Inertias of the bodies and the forces that their motion at constant joint speeds takes, in place.
-
-    Recursive Newton-Euler (Featherstone, "Rigid Body Dynamics Algorithms", 2008), all about the world's origin;
-    gravity is an upward acceleration of the base, and Bullet's damping of bodies is added.
-    """
-    lanes = speed.shape[-1]
-    axes, origin = fixed(axes, (N + 1, 3, 3, LANES)), fixed(origin, (N + 1, 3, LANES))
-    speed, spatial = fixed(speed, (N, LANES)), fixed(spatial, (12, LANES))
-    body, twist = fixed(body, (N, 15, LANES)), fixed(twist, (N, 6, LANES))
-    for r in range(12):
-        for m in range(lanes):
-            spatial[r, m] = _GRAVITY if r == 11 else 0.0
-    for k in range(N):
-        mass = _MASS[k]
-        c0, c1, c2 = _CENTER[k, 0], _CENTER[k, 1], _CENTER[k, 2]
-        i00, i11, i22 = _INERTIA[k, 0, 0], _INERTIA[k, 1, 1], _INERTIA[k, 2, 2]
-        i01, i02, i12 = _INERTIA[k, 0, 1], _INERTIA[k, 0, 2], _INERTIA[k, 1, 2]
-        for m in range(lanes):
-            a0, a1, a2 = axes[k + 1, 0, 0, m], axes[k + 1, 1, 0, m], axes[k + 1, 2, 0, m]
-            b0, b1, b2 = axes[k + 1, 0, 1, m], axes[k + 1, 1, 1, m], axes[k + 1, 2, 1, m]
-            z0, z1, z2 = axes[k + 1, 0, 2, m], axes[k + 1, 1, 2, m], axes[k + 1, 2, 2, m]
-            p0, p1, p2 = origin[k + 1, 0, m], origin[k + 1, 1, m], origin[k + 1, 2, m]
-            x0, x1, x2 = (
-                p0 + a0 * c0 + b0 * c1 + z0 * c2,
-                p1 + a1 * c0 + b1 * c1 + z1 * c2,
-                p2 + a2 * c0 + b2 * c1 + z2 * c2,
-            )
-            # Spatial axis of the joint, velocity and acceleration of the body.
-            u0, u1, u2 = p1 * z2 - p2 * z1, p2 * z0 - p0 * z2, p0 * z1 - p1 * z0
-            rate = speed[k, m]
-            w0, w1, w2 = spatial[0, m] + z0 * rate, spatial[1, m] + z1 * rate, spatial[2, m] + z2 * rate
-            v0, v1, v2 = spatial[3, m] + u0 * rate, spatial[4, m] + u1 * rate, spatial[5, m] + u2 * rate
-            e0 = spatial[6, m] + rate * (w1 * z2 - w2 * z1)
-            e1 = spatial[7, m] + rate * (w2 * z0 - w0 * z2)
-            e2 = spatial[8, m] + rate * (w0 * z1 - w1 * z0)
-            f0 = spatial[9, m] + rate * (w1 * u2 - w2 * u1 + v1 * z2 - v2 * z1)
-            f1 = spatial[10, m] + rate * (w2 * u0 - w0 * u2 + v2 * z0 - v0 * z2)
-            f2 = spatial[11, m] + rate * (w0 * u1 - w1 * u0 + v0 * z1 - v1 * z0)
-            # Inertia about the centre of mass, world axes.
-            s0, s1, s2 = (
-                a0 * i00 + b0 * i01 + z0 * i02,
-                a1 * i00 + b1 * i01 + z1 * i02,
-                a2 * i00 + b2 * i01 + z2 * i02,
-            )
-            t0, t1, t2 = (
-                a0 * i01 + b0 * i11 + z0 * i12,
-                a1 * i01 + b1 * i11 + z1 * i12,
-                a2 * i01 + b2 * i11 + z2 * i12,
-            )
-            q0, q1, q2 = (
-                a0 * i02 + b0 * i12 + z0 * i22,
-                a1 * i02 + b1 * i12 + z1 * i22,
-                a2 * i02 + b2 * i12 + z2 * i22,
-            )
-            g00, g11, g22 = (
-                s0 * a0 + t0 * b0 + q0 * z0,
-                s1 * a1 + t1 * b1 + q1 * z1,
-                s2 * a2 + t2 * b2 + q2 * z2,
-            )
-            g01, g02, g12 = (
-                s0 * a1 + t0 * b1 + q0 * z1,
-                s0 * a2 + t0 * b2 + q0 * z2,
-                s1 * a2 + t1 * b2 + q1 * z2,
-            )
-            # Damping, at the centre of mass.
-            y0, y1, y2 = v0 + w1 * x2 - w2 * x1, v1 + w2 * x0 - w0 * x2, v2 + w0 * x1 - w1 * x0
-            drag = mass * _DAMPING * (1.0 + np.sqrt(y0 * y0 + y1 * y1 + y2 * y2))
-            d0, d1, d2 = drag * y0, drag * y1, drag * y2
-            drag = _DAMPING * (1.0 + np.sqrt(w0 * w0 + w1 * w1 + w2 * w2))
-            n0 = drag * (g00 * w0 + g01 * w1 + g02 * w2) + x1 * d2 - x2 * d1
-            n1 = drag * (g01 * w0 + g11 * w1 + g12 * w2) + x2 * d0 - x0 * d2
-            n2 = drag * (g02 * w0 + g12 * w1 + g22 * w2) + x0 * d1 - x1 * d0
-            # Inertia about the world's origin, momentum, force.
-            h0, h1, h2 = mass * x0, mass * x1, mass * x2
-            g00, g11, g22 = g00 + h1 * x1 + h2 * x2, g11 + h0 * x0 + h2 * x2, g22 + h0 * x0 + h1 * x1
-            g01, g02, g12 = g01 - h0 * x1, g02 - h0 * x2, g12 - h1 * x2
-            l0 = g00 * w0 + g01 * w1 + g02 * w2 + h1 * v2 - h2 * v1
-            l1 = g01 * w0 + g11 * w1 + g12 * w2 + h2 * v0 - h0 * v2
-            l2 = g02 * w0 + g12 * w1 + g22 * w2 + h0 * v1 - h1 * v0
-            m0, m1, m2 = (
-                mass * v0 + w1 * h2 - w2 * h1,
-                mass * v1 + w2 * h0 - w0 * h2,
-                mass * v2 + w0 * h1 - w1 * h0,
-            )
-            n0 += g00 * e0 + g01 * e1 + g02 * e2 + h1 * f2 - h2 * f1 + w1 * l2 - w2 * l1 + v1 * m2 - v2 * m1
-            n1 += g01 * e0 + g11 * e1 + g12 * e2 + h2 * f0 - h0 * f2 + w2 * l0 - w0 * l2 + v2 * m0 - v0 * m2
-            n2 += g02 * e0 + g12 * e1 + g22 * e2 + h0 * f1 - h1 * f0 + w0 * l1 - w1 * l0 + v0 * m1 - v1 * m0
-            d0 += mass * f0 + e1 * h2 - e2 * h1 + w1 * m2 - w2 * m1
-            d1 += mass * f1 + e2 * h0 - e0 * h2 + w2 * m0 - w0 * m2
-            d2 += mass * f2 + e0 * h1 - e1 * h0 + w0 * m1 - w1 * m0
-            spatial[0, m], spatial[1, m], spatial[2, m] = w0, w1, w2
-            spatial[3, m], spatial[4, m], spatial[5, m] = v0, v1, v2
-            spatial[6, m], spatial[7, m], spatial[8, m] = e0, e1, e2
-            spatial[9, m], spatial[10, m], spatial[11, m] = f0, f1, f2
-            twist[k, 0, m], twist[k, 1, m], twist[k, 2, m] = z0, z1, z2
-            twist[k, 3, m], twist[k, 4, m], twist[k, 5, m] = u0, u1, u2
-            body[k, 0, m], body[k, 1, m], body[k, 2, m] = g00, g11, g22
-            body[k, 3, m], body[k, 4, m], body[k, 5, m] = g01, g02, g12
-            body[k, 6, m], body[k, 7, m], body[k, 8, m] = h0, h1, h2
-            body[k, 9, m], body[k, 10, m], body[k, 11, m] = n0, n1, n2
-            body[k, 12, m], body[k, 13, m], body[k, 14, m] = d0, d1, d2
-
-
-@njit(cache=True, fastmath=True)
-def write_dynamics(twist: Array, body: Array, force: Array, matrix: Array, torque: Array) -> None:
-    """Mass matrices (7, 7, L), lower triangle, and −bias torques (7, L): composite bodies, from the hand backwards.
-
-    Args:
-        twist: of `write_bodies`.
-        body: of `write_bodies`; receives the sums from each body to the hand.
-        force: scratch, (12, L).
-        matrix: receives the mass matrices.
-        torque: receives minus the torques that gravity and motion at constant joint speeds take (N m).
-    """
-    lanes = torque.shape[-1]
-    twist, body, force = fixed(twist, (N, 6, LANES)), fixed(body, (N, 15, LANES)), fixed(force, (12, LANES))
-    matrix, torque = fixed(matrix, (N, N, LANES)), fixed(torque, (N, LANES))
-    mass = 0.0
-    for j in range(N - 1, -1, -1):
-        mass += _MASS[j]
-        if j < N - 1:
-            for r in range(15):
-                for m in range(lanes):
-                    body[j, r, m] += body[j + 1, r, m]
-        for m in range(lanes):
-            z0, z1, z2 = twist[j, 0, m], twist[j, 1, m], twist[j, 2, m]
-            u0, u1, u2 = twist[j, 3, m], twist[j, 4, m], twist[j, 5, m]
-            g01, g02, g12 = body[j, 3, m], body[j, 4, m], body[j, 5, m]
-            h0, h1, h2 = body[j, 6, m], body[j, 7, m], body[j, 8, m]
-            force[0, m] = body[j, 0, m] * z0 + g01 * z1 + g02 * z2 + h1 * u2 - h2 * u1
-            force[1, m] = g01 * z0 + body[j, 1, m] * z1 + g12 * z2 + h2 * u0 - h0 * u2
-            force[2, m] = g02 * z0 + g12 * z1 + body[j, 2, m] * z2 + h0 * u1 - h1 * u0
-            force[3, m] = mass * u0 + z1 * h2 - z2 * h1
-            force[4, m] = mass * u1 + z2 * h0 - z0 * h2
-            force[5, m] = mass * u2 + z0 * h1 - z1 * h0
-        for i in range(j + 1):
-            for m in range(lanes):
-                matrix[j, i, m] = (
-                    force[0, m] * twist[i, 0, m]
-                    + force[1, m] * twist[i, 1, m]
-                    + force[2, m] * twist[i, 2, m]
-                    + force[3, m] * twist[i, 3, m]
-                    + force[4, m] * twist[i, 4, m]
-                    + force[5, m] * twist[i, 5, m]
-                )
-        for m in range(lanes):
-            total = 0.0
-            for r in range(6):
-                total -= twist[j, r, m] * body[j, 9 + r, m]
-            torque[j, m] = total

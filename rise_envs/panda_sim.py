@@ -83,7 +83,7 @@ class PandaSim:
 
             self._engine = Engine(render_mode="rgb_array", n_substeps=N_SUBSTEPS, renderer="Tiny")
             robot = Panda(self._engine, block_gripper=True, base_position=np.array([-0.6, 0.0, 0.0]))
-            self._engine.create_plane(z_offset=-0.4)
+            # No ground below the table: nothing gets there, and the engine would look for contacts all the time.
             self._engine.create_table(length=1.1, width=0.7, height=0.4, x_offset=-0.3)
         self._bullet = pybullet
         self._client: int = self._engine.physics_client._client

@@ -9,10 +9,12 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from rise_envs import goals, obstacles, streams
+from rise_envs import goals
 from rise_envs.actions import checked_action
-from rise_envs.panda_scene import DEFAULTS, Params, Sphere, candidates
-from rise_envs.task import Task
+from rise_envs.episodes import EpisodeStreams
+from rise_envs.panda_scene import DEFAULTS, Params
+from rise_envs.panda_task import PandaTask, make_spaces
+from rise_envs.streams import episode_keys
 
 if TYPE_CHECKING:
     from rise_envs.panda_sim import PandaSim
@@ -20,7 +22,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 
-class SafePandaEnv(gym.Env):
+class SafePandaEnv(PandaTask, gym.Env):
     """A Franka Panda arm reaches a goal past a moving sphere whose motion cannot be predicted.
 
     ## Description
@@ -100,42 +102,16 @@ class SafePandaEnv(gym.Env):
     ) -> None:
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
+        super().__init__(reward_type, terminate_on_collision, params)
         self.render_mode = render_mode
-        self.reward_type = goals.check_reward_type(reward_type)
-        self.terminate_on_collision = bool(terminate_on_collision)
-        self.params = params
-        self.action_space = spaces.Box(-1.0, 1.0, (3,), np.float32)
-        self.observation_space = _observation_space(params)
+        self.observation_space, self.action_space = make_spaces(params)
         self.perceived: Array | None = None  # the reading as a noise wrapper last handed it out
-        self._sphere: Sphere | None = None
-        from rise_envs import panda_sim  # the engine is loaded by those who run the arm only
+        self._streams = EpisodeStreams(1)
+        self._sphere: Array | None = None  # its true reading, (1, 7)
+        from rise_envs import panda_sim, panda_starts  # the engine is loaded by those who run the arm only
 
+        self._starts, self._constants = panda_starts, panda_starts.constants(params)
         self._sim: PandaSim | None = panda_sim.PandaSim(visuals=render_mode is not None)
-
-    @staticmethod
-    def task(params: Params = DEFAULTS, **_: Any) -> Task:
-        """The meaning of the numbers, for agents (see :class:`rise_envs.task.Task`).
-
-        The reading noise at level 1 has the ratio to the sphere's size that the vehicle's task has.
-        """
-        p = params
-        scale = tuple(np.repeat(p.noise_scale, (3, 3, 1)).tolist())
-        return Task(
-            dim=3,
-            n_obstacles=1,
-            noise_scale=scale,
-            robot_radius=p.hand_radius,
-            goal_radius=p.goal_radius,
-            dt=p.dt,
-            max_speed=p.max_hand_speed,
-            pose=_pose,
-            body_state=tuple(range(13)),
-        )
-
-    @property
-    def noise_scale(self) -> dict[str, Array]:
-        """Standard deviation of the reading at noise level 1, per channel."""
-        return {"obstacle": np.array(self.task(self.params).noise_scale)}
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -149,10 +125,13 @@ class SafePandaEnv(gym.Env):
         sim = self._open_sim()
         sim.reset()
         self._state, self.perceived = sim.state(), None
-        self._goal, self._sphere = self._draw_start(sim, np.array([streams.draw_key(self.np_random)]))
-        self._least = self._nearest = sim.clearance(self._sphere.center, self._sphere.radius)
+        self._streams.seed(seed, rng=self.np_random)
+        key = episode_keys(*self._streams.next(np.array([0])))
+        goal, sphere, self._motion_key, *_ = self._starts.begin(key, self._constants)
+        self._goal, self._sphere, self._time = goal[0], sphere, np.zeros(1, np.int64)
+        self._least = self._nearest = sim.clearance(sphere[0, :3], float(sphere[0, 6]))
         self._trail = [self._state[:3]]
-        return self._observe(self._sphere), self._info(self._state[:3], reached=False)
+        return self._observe(sphere), self._info(self._state[:3], reached=False)
 
     def step(self, action: Any) -> tuple[dict[str, Array], float, bool, bool, dict[str, Any]]:
         """Move the arm and the sphere for one step.
@@ -165,10 +144,12 @@ class SafePandaEnv(gym.Env):
         sim, sphere = self._open_sim(), self._started()
         commanded = checked_action(action, self.action_space).astype(np.float32)
         before = self._state[:3]
-        self._least, self._nearest = sim.step(
-            commanded, sphere.center, sphere.velocity, sphere.radius, self._nearest
+        x, y, z, u, v, w, radius = sphere[0].tolist()
+        self._least, self._nearest = sim.step(commanded, (x, y, z), (u, v, w), radius, self._nearest)
+        sphere = self._sphere = self._starts.advance(
+            sphere, self._goal[None], self._motion_key, self._time, self._constants.rules
         )
-        sphere.advance()
+        self._time = self._time + 1
         self._state = sim.state()
         hand = self._state[:3]
         self._trail.append(hand)
@@ -177,20 +158,6 @@ class SafePandaEnv(gym.Env):
         reward = float(self.compute_reward(hand, self._goal, info))
         terminated = reached or (self.terminate_on_collision and info["cost"] > 0)
         return self._observe(sphere), reward, terminated, False, info
-
-    def compute_reward(self, achieved_goal: Array, desired_goal: Array, info: Any) -> Any:
-        """Reward of one transition or of a batch: see :func:`rise_envs.goals.reward`."""
-        return goals.reward(achieved_goal, desired_goal, info, self.params.goal_radius, self.reward_type)
-
-    def compute_terminated(self, achieved_goal: Array, desired_goal: Array, info: Any) -> Any:
-        """Whether the goal is reached (or, with ``terminate_on_collision``, the step cost something)."""
-        return goals.terminated(
-            achieved_goal, desired_goal, info, self.params.goal_radius, self.terminate_on_collision
-        )
-
-    def compute_truncated(self, achieved_goal: Array, desired_goal: Array, info: Any) -> Any:
-        """Never: the time limit truncates."""
-        return np.zeros(np.shape(achieved_goal)[:-1], bool)[()]
 
     def render(self) -> NDArray[np.uint8] | None:
         """The scene as an RGB array (480, 720, 3).
@@ -213,7 +180,7 @@ class SafePandaEnv(gym.Env):
             shot,
             self._goal,
             self.params.goal_radius,
-            sphere.reading,
+            sphere[0],
             self.perceived,
             self._trail,
             self._least[0],
@@ -231,28 +198,17 @@ class SafePandaEnv(gym.Env):
             raise RuntimeError("this environment is closed: make a new one with gymnasium.make()")
         return self._sim
 
-    def _started(self) -> Sphere:
+    def _started(self) -> Array:
         if self._sphere is None:
             raise gym.error.ResetNeeded("call reset() to start an episode")
         return self._sphere
 
-    def _draw_start(self, sim: PandaSim, key: NDArray[np.uint64]) -> tuple[Array, Sphere]:
-        """Goal and sphere of the first candidate that is fair and leaves the arm clear."""
-        p, motion = self.params, self.params.motion
-        place_key, motion_key = streams.split(key, 0), streams.split(key, 1)
-        velocity = obstacles.draw_velocity(motion_key, 0, 1, motion)[0, 0]
-        needed = p.start_clearance + p.start_time * float(np.linalg.norm(velocity))
-        for goal, radius, center in candidates(place_key, self._state[:3], needed, p):
-            if sim.clearance(center, radius, within=needed)[0] >= needed:
-                return goal, Sphere(center, radius, goal, velocity, motion_key, motion)
-        raise RuntimeError("no fair start found: these parameters leave goal or sphere no room")
-
-    def _observe(self, sphere: Sphere) -> dict[str, Array]:
+    def _observe(self, sphere: Array) -> dict[str, Array]:
         return {
             "observation": self._state.copy(),
             "achieved_goal": self._state[:3].copy(),
             "desired_goal": self._goal.copy(),
-            "obstacle": sphere.reading,
+            "obstacle": sphere[0].copy(),
         }
 
     def _info(self, before: Array, reached: bool) -> dict[str, Any]:
@@ -265,22 +221,3 @@ class SafePandaEnv(gym.Env):
             "is_success": reached,
             "previous_achieved_goal": before.copy(),
         }
-
-
-def _pose(state: Array) -> tuple[Array, Array]:
-    """The hand's frame: its position, axes parallel to the world's."""
-    return state[..., :3], np.broadcast_to(np.eye(3), (*state.shape[:-1], 3, 3))
-
-
-def _observation_space(p: Params) -> spaces.Dict:
-    def box(low: Any, high: Any) -> spaces.Box:
-        return spaces.Box(np.array(low, np.float64), np.array(high, np.float64), dtype=np.float64)
-
-    state = np.repeat([2.0, 10.0, 2 * np.pi], (3, 3, 7))
-    speed = np.full(3, p.max_speed)
-    return spaces.Dict(
-        observation=box(-state, state),
-        achieved_goal=box(-state[:3], state[:3]),
-        desired_goal=box(p.goal_low, p.goal_high),
-        obstacle=box((*p.sphere_low, *-speed, p.radius[0]), (*p.sphere_high, *speed, p.radius[1])),
-    )

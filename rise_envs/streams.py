@@ -122,8 +122,3 @@ def episode_keys(base: NDArray, number: NDArray) -> NDArray:
         number: int64, (B,).
     """
     return arithmetic.mix(base, number)
-
-
-def draw_key(rng: np.random.Generator) -> np.uint64:
-    """The next episode's key from an environment's own generator (one call per episode)."""
-    return rng.integers(0, 2**64, dtype=np.uint64)

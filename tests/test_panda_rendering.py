@@ -132,4 +132,4 @@ def test_rendering_an_episode_adds_nothing_to_the_simulation(env: SafePandaEnv) 
         env.step(np.ones(3))
         second = env.render()
         assert first is not None and second is not None and (first != second).any()
-    assert bullet.getNumBodies(physicsClientId=client) == bodies == 3
+    assert bullet.getNumBodies(physicsClientId=client) == bodies == 2

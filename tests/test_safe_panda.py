@@ -13,8 +13,8 @@ import pytest
 from scipy.optimize import nnls
 
 import rise_envs  # noqa: F401
-from rise_envs import obstacles, panda_sim, streams
-from rise_envs.panda_scene import DEFAULTS, Params, Sphere, candidates
+from rise_envs import obstacles, panda_sim, panda_starts
+from rise_envs.panda_scene import DEFAULTS, Params
 from rise_envs.safe_panda import SafePandaEnv
 
 HAND = np.array([0.0384397, 0.0, 0.1974001])  # at the start
@@ -196,10 +196,9 @@ def test_the_link_in_collision_is_named(made: SafePandaEnv, center: tuple, links
 def _place(
     env: SafePandaEnv, center: tuple, velocity: tuple = REST, radius: float = 0.05, params: Params = DEFAULTS
 ) -> None:
-    """Put the sphere of the running episode somewhere else."""
-    env._sphere = Sphere(
-        np.array(center), radius, np.full(3, 5.0), np.array(velocity), np.array([1], np.uint64), params.motion
-    )
+    """Put the sphere of the running episode somewhere else, and its goal out of the way."""
+    env._sphere, env._goal = np.array([[*center, *velocity, radius]]), np.full(3, 5.0)
+    env._motion_key, env._constants = np.array([1]), panda_starts.constants(params)
     assert env._sim is not None
     env._nearest = env._sim.clearance(center, radius)
 
@@ -250,45 +249,31 @@ def test_least_clearance_against_a_look_after_every_substep(monkeypatch: pytest.
 # --- the sphere -------------------------------------------------------------------------------------------
 
 
-def _sphere(seed: int, params: Params = DEFAULTS) -> tuple[Sphere, np.ndarray, np.ndarray]:
-    key = np.array([streams.key_from_seed(seed)])
-    goal, radius, center = next(candidates(streams.split(key, 0), HAND, 0.05, params))
-    velocity = obstacles.draw_velocity(key, 0, 1, params.motion)[0, 0]
-    return Sphere(center, radius, goal, velocity, key, params.motion), goal, key
-
-
 def test_the_sphere_moves_as_the_obstacles_of_every_environment() -> None:
-    for seed in range(20):
-        sphere, goal, key = _sphere(seed)
-        motion, radius = DEFAULTS.motion, np.array([[sphere.radius]])
-        position, velocity = np.array([[sphere.center]]), np.array([[sphere.velocity]])
-        for step in range(1, 200):
-            position = position + motion.dt * velocity
-            velocity = obstacles.redraw(velocity, key, step, motion)
-            velocity = obstacles.keep_inside(position, velocity, radius, goal[None], motion)
-            sphere.advance()
-            expected = obstacles.readings(position, velocity, radius)[0]
-            np.testing.assert_allclose(sphere.reading, expected, rtol=0, atol=1e-12)
+    count, motion = 20, DEFAULTS.motion
+    goal, sphere, key, *_ = panda_starts.begin(np.arange(count), panda_starts.constants(DEFAULTS))
+    position, velocity, radius = sphere[:, None, :3], sphere[:, None, 3:6], sphere[:, 6:]
+    for step in range(1, 200):
+        position = position + motion.dt * velocity
+        velocity = obstacles.redraw(velocity, key.view(np.uint64), step, motion)
+        velocity = obstacles.keep_inside(position, velocity, radius, goal, motion)
+        sphere = panda_starts.advance(sphere, goal, key, np.full(count, step - 1), motion.rules)
+        np.testing.assert_array_equal(sphere, obstacles.readings(position, velocity, radius))
 
 
 def test_the_sphere_keeps_its_bounds_and_changes_its_mind() -> None:
-    changes = steps = 0
-    for seed in range(60):
-        sphere, goal, _ = _sphere(seed)
-        before = sphere.velocity
-        for _ in range(100):
-            assert (sphere.reading[:3] >= DEFAULTS.sphere_low).all()
-            assert (sphere.reading[:3] <= DEFAULTS.sphere_high).all()
-            assert np.linalg.norm(sphere.velocity) <= DEFAULTS.max_speed + 1e-12
-            assert np.linalg.norm(sphere.reading[:3] - goal) >= sphere.radius + 0.12 - 1e-9
-            sphere.advance()
-            speed = np.linalg.norm(sphere.velocity)
-            changed = speed != pytest.approx(np.linalg.norm(before), abs=1e-12)
-            changes += 1 if changed and speed > 0 else 0
-            steps += 1
-            before = sphere.velocity
+    changes, steps, count = 0, 100, 60
+    goal, sphere, key, *_ = panda_starts.begin(np.arange(count), panda_starts.constants(DEFAULTS))
+    for step in range(steps):
+        center, before = sphere[:, :3], np.linalg.norm(sphere[:, 3:6], axis=1)
+        assert (center >= DEFAULTS.sphere_low).all() and (center <= DEFAULTS.sphere_high).all()
+        assert (before <= DEFAULTS.max_speed + 1e-12).all()
+        assert (np.linalg.norm(center - goal, axis=1) >= sphere[:, 6] + 0.12 - 1e-9).all()
+        sphere = panda_starts.advance(sphere, goal, key, np.full(count, step), DEFAULTS.motion.rules)
+        speed = np.linalg.norm(sphere[:, 3:6], axis=1)
+        changes += ((np.abs(speed - before) > 1e-12) & (speed > 0)).sum()
     # A redraw changes the speed, a reflection does not.
-    assert changes / (steps * DEFAULTS.dt) == pytest.approx(1 / DEFAULTS.redraw_interval, rel=0.15)
+    assert changes / (count * steps * DEFAULTS.dt) == pytest.approx(1 / DEFAULTS.redraw_interval, rel=0.15)
 
 
 # --- starts -----------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
@@ -103,7 +104,31 @@ def test_seeds_and_tags_give_different_keys() -> None:
         streams.key_from_seed(-1)
 
 
-def test_an_episode_costs_its_environment_one_draw() -> None:
-    a, b = np.random.default_rng(0), np.random.default_rng(0)
-    keys = [int(streams.draw_key(a)) for _ in range(3)]
-    assert keys == b.integers(0, 2**64, 3, dtype=np.uint64).tolist()
+def test_seeds_name_streams_of_episodes() -> None:
+    """A range, a list, arrays and beyond 64 bits: different seeds, different streams, the same seed the same."""
+    seeds = [*range(1000), 2**63, 2**64 - 1, 2**64, 2**200]
+    bases = streams.seed_bases(seeds)
+    assert bases.dtype == np.int64 and len(np.unique(bases)) == len(seeds)
+    np.testing.assert_array_equal(streams.seed_bases(range(1000)), bases[:1000])
+    np.testing.assert_array_equal(streams.seed_bases(range(2**64 - 1, 2**64 + 1)), bases[-3:-1])
+    np.testing.assert_array_equal(streams.seed_bases(np.arange(5)), bases[:5])
+    keys = streams.episode_keys(np.repeat(bases, 50), np.tile(np.arange(50), len(seeds)))
+    assert len(np.unique(keys)) == 50 * len(seeds)
+    for wrong in (-1, 0.5, "7"):
+        with pytest.raises(ValueError, match="seed must"):
+            streams.seed_bases([3, wrong])
+    with pytest.raises(ValueError, match="negative"):
+        streams.seed_bases(range(-1, 3))
+
+
+def test_streams_are_the_same_on_tensors() -> None:
+    keys, counter = streams.seed_keys(range(500), 9), np.arange(500)
+    signed, count = torch.from_numpy(keys.view(np.int64)), torch.from_numpy(counter)
+    for draw in (streams.bits, streams.uniform):
+        np.testing.assert_array_equal(
+            draw(signed, count).numpy().view(draw(keys, counter).dtype), draw(keys, counter)
+        )
+    np.testing.assert_array_equal(streams.split(signed, 3).numpy().view(np.uint64), streams.split(keys, 3))
+    np.testing.assert_allclose(
+        streams.normal(signed, count).numpy(), streams.normal(keys, counter), rtol=1e-13
+    )

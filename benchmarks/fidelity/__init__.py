@@ -1,0 +1,1 @@
+"""How far the kinematic Panda is from the engine: ``python -m benchmarks.fidelity``."""

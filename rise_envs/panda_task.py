@@ -1,0 +1,85 @@
+"""What the environments of the Panda share: arguments, spaces, goal API, description."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from rise_envs import goals
+from rise_envs.panda_scene import DEFAULTS, Params
+from rise_envs.task import Task
+
+Array = NDArray[np.float64]
+
+
+class PandaTask:
+    """Mixed into the environments: see :class:`rise_envs.safe_panda.SafePandaEnv` for all meanings."""
+
+    def __init__(self, reward_type: str, terminate_on_collision: bool, params: Params) -> None:
+        self.reward_type = goals.check_reward_type(reward_type)
+        self.terminate_on_collision = bool(terminate_on_collision)
+        self.params = params
+
+    @staticmethod
+    def task(params: Params = DEFAULTS, **_: Any) -> Task:
+        """The meaning of the numbers, for agents (see :class:`rise_envs.task.Task`).
+
+        The reading noise at level 1 has the ratio to the sphere's size that the vehicle's task has.
+        """
+        p = params
+        scale = tuple(np.repeat(p.noise_scale, (3, 3, 1)).tolist())
+        return Task(
+            dim=3,
+            n_obstacles=1,
+            noise_scale=scale,
+            robot_radius=p.hand_radius,
+            goal_radius=p.goal_radius,
+            dt=p.dt,
+            max_speed=p.max_hand_speed,
+            pose=_pose,
+            body_state=tuple(range(13)),
+        )
+
+    @property
+    def noise_scale(self) -> dict[str, Array]:
+        """Standard deviation of the reading at noise level 1, per channel."""
+        return {"obstacle": np.array(self.task(self.params).noise_scale)}
+
+    def compute_reward(self, achieved_goal: Array, desired_goal: Array, info: Any) -> Any:
+        """Reward of one transition or of a batch: see :func:`rise_envs.goals.reward`."""
+        return goals.reward(achieved_goal, desired_goal, info, self.params.goal_radius, self.reward_type)
+
+    def compute_terminated(self, achieved_goal: Array, desired_goal: Array, info: Any) -> Any:
+        """Whether the goal is reached (or, with ``terminate_on_collision``, the step cost something)."""
+        return goals.terminated(
+            achieved_goal, desired_goal, info, self.params.goal_radius, self.terminate_on_collision
+        )
+
+    def compute_truncated(self, achieved_goal: Array, desired_goal: Array, info: Any) -> Any:
+        """Never: the time limit truncates."""
+        return np.zeros(np.shape(achieved_goal)[:-1], bool)[()]
+
+
+def _pose(state: Array) -> tuple[Array, Array]:
+    """The hand's frame: its position, axes parallel to the world's."""
+    return state[..., :3], np.broadcast_to(np.eye(3), (*state.shape[:-1], 3, 3))
+
+
+def make_spaces(p: Params) -> tuple[spaces.Dict, spaces.Box]:
+    """Observation and action space of one arm."""
+
+    def box(low: Any, high: Any) -> spaces.Box:
+        return spaces.Box(np.array(low, np.float64), np.array(high, np.float64), dtype=np.float64)
+
+    state = np.repeat([2.0, 10.0, 2 * np.pi], (3, 3, 7))
+    speed = np.full(3, p.max_speed)
+    observation = spaces.Dict(
+        observation=box(-state, state),
+        achieved_goal=box(-state[:3], state[:3]),
+        desired_goal=box(p.goal_low, p.goal_high),
+        obstacle=box((*p.sphere_low, *-speed, p.radius[0]), (*p.sphere_high, *speed, p.radius[1])),
+    )
+    return observation, spaces.Box(-1.0, 1.0, (3,), np.float32)
