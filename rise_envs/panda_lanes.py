@@ -55,7 +55,10 @@ def entrance(function: Callable) -> Any:
     """``function``, compiled on its first call and kept on disk, together with all the lanes that it is built on."""
     # numba's cache watches the function's own file only; its name makes it watch the others, too.
     function.__qualname__ += f"_{_DIGEST}"
-    return njit(cache=True, fastmath=True)(function)
+    try:
+        return njit(cache=True, nogil=True, fastmath=True)(function)
+    except RuntimeError:  # no folder to keep it in can be written to
+        return njit(nogil=True, fastmath=True)(function)
 
 
 @intrinsic
