@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.vector import AutoresetMode
-from gymnasium.vector.utils import batch_space
 
 from rise_agents import AGENTS, make_agent
 from rise_agents.demonstrations import generate
@@ -175,18 +174,6 @@ def test_agents_act_on_tensors_as_on_arrays(name: str) -> None:
     np.testing.assert_array_equal(
         agent.predict(tensors, deterministic=True)[0], agent.predict(seen, deterministic=True)[0]
     )
-
-
-def test_the_spaces_hold_one_rows_bounds_only() -> None:
-    env = make(1_000)
-    for space, single in (
-        (env.observation_space, env.single_observation_space),
-        (env.action_space, env.single_action_space),
-    ):
-        assert space == batch_space(single, 1_000)
-        assert space.contains(space.sample())
-    boxes = [*env.observation_space.values(), env.action_space]
-    assert all(box.low.strides[0] == box.high.strides[0] == 0 for box in boxes)
 
 
 # --- threads ----------------------------------------------------------------------------------------------

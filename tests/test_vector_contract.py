@@ -1,28 +1,40 @@
-"""The batched vehicle against Gymnasium's own vectorisation of the single one: equal to the last bit."""
+"""Every native batched form against Gymnasium's own vectorisation of the single one: equal to the last bit."""
 
 from __future__ import annotations
 
 import copy
+import importlib
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
 
-import rise_envs  # noqa: F401
-from rise_envs.ground_vehicle_vector import GroundVehicleVectorEnv
+from rise_agents.experts import make_expert
+from rise_envs import ENVS
+from rise_envs.task import task_of
 
-ID = "RISE-GroundVehicle-v0"
 MODES = list(AutoresetMode)
+NATIVE = [env_id for env_id, (_, vector_entry, _) in ENVS.items() if vector_entry]
+COLLIDES = {"terminate_on_collision": True, "reward_type": "sparse"}
+KINDS = [(env_id, kwargs) for env_id in NATIVE for kwargs in ({}, COLLIDES, {"max_episode_steps": 7})]
+KINDS.append(("RISE-GroundVehicle-v0", {**COLLIDES, "n_obstacles": 3}))
 
 
-def native(n: int = 5, mode: AutoresetMode = AutoresetMode.NEXT_STEP, **kwargs: Any) -> Any:
-    return gym.make_vec(ID, n, autoreset_mode=mode, **kwargs)
+@pytest.fixture(params=NATIVE)
+def env_id(request: pytest.FixtureRequest) -> str:
+    return request.param
 
 
-def reference(n: int, mode: AutoresetMode, **kwargs: Any) -> Any:
-    return gym.make_vec(ID, n, vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode}, **kwargs)
+def native(env_id: str, n: int = 5, mode: AutoresetMode = AutoresetMode.NEXT_STEP, **kwargs: Any) -> Any:
+    return gym.make_vec(env_id, n, vectorization_mode="vector_entry_point", autoreset_mode=mode, **kwargs)
+
+
+def reference(env_id: str, n: int, mode: AutoresetMode, **kwargs: Any) -> Any:
+    vector_kwargs = {"autoreset_mode": mode}
+    return gym.make_vec(env_id, n, vectorization_mode="sync", vector_kwargs=vector_kwargs, **kwargs)
 
 
 def assert_same(a: Any, b: Any, where: str = "") -> None:
@@ -46,13 +58,15 @@ def assert_same(a: Any, b: Any, where: str = "") -> None:
         assert a == b, where
 
 
-def towards_goal(observation: dict[str, Any], rng: np.random.Generator) -> np.ndarray:
-    """Actions that reach goals and now and then meet a disc, so that every kind of end occurs."""
-    way = observation["desired_goal"] - observation["achieved_goal"]
-    turn = np.arctan2(way[:, 1], way[:, 0]) - observation["observation"][:, 2]
-    turn = (turn + np.pi) % (2 * np.pi) - np.pi
-    action = np.stack((np.full(len(turn), 2.5), 2 * turn + rng.normal(0, 0.5, len(turn))), -1)
-    return np.clip(action, [0, -1.5], [2.5, 1.5]).astype(np.float32)
+def blindly(env_id: str) -> Any:
+    """Actions of an expert that sees no obstacle: it reaches goals and meets obstacles, so that all ends occur."""
+    expert, channels = make_expert("cbf", env_id), len(task_of(env_id).noise_scale)
+
+    def act(observation: dict[str, Any]) -> np.ndarray:
+        far = observation["obstacle"][:, :channels] + 1e3
+        return expert.predict({**observation, "obstacle": far})[0].astype(np.float32)
+
+    return act
 
 
 def reset_ended(env: Any, ended: np.ndarray) -> Any:
@@ -60,22 +74,14 @@ def reset_ended(env: Any, ended: np.ndarray) -> Any:
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize(
-    "kwargs",
-    [
-        {},
-        {"n_obstacles": 3, "terminate_on_collision": True, "reward_type": "sparse"},
-        {"max_episode_steps": 40},
-    ],
-    ids=["default", "sparse-collision-3-discs", "short"],
-)
-def test_equals_sync_vector_env(mode: AutoresetMode, kwargs: dict[str, Any]) -> None:
-    a, b = native(5, mode, **kwargs), reference(5, mode, **kwargs)
-    rng, ends = np.random.default_rng(0), 0
+@pytest.mark.parametrize(("env_id", "kwargs"), KINDS, ids=str)
+def test_equals_sync_vector_env(env_id: str, kwargs: dict[str, Any], mode: AutoresetMode) -> None:
+    a, b = native(env_id, 5, mode, **kwargs), reference(env_id, 5, mode, **kwargs)
+    act, ends = blindly(env_id), 0
     out_a, out_b = a.reset(seed=7), b.reset(seed=7)
     assert_same(out_a, out_b, "reset")
-    for t in range(250):
-        action = towards_goal(out_a[0], rng)
+    for t in range(ENVS[env_id][2] + 20):
+        action = act(out_a[0])
         out_a, out_b = a.step(action), b.step(action)
         assert_same(out_a, out_b, f"step {t}")
         ended = out_a[2] | out_a[3]
@@ -84,18 +90,19 @@ def test_equals_sync_vector_env(mode: AutoresetMode, kwargs: dict[str, Any]) -> 
             out_a, out_b = reset_ended(a, ended), reset_ended(b, ended)
             assert_same(out_a, out_b, f"reset after {t}")
     assert ends > 5
+    a.close(), b.close()
 
 
-def test_reset_in_mid_episode_goes_on_with_the_generators() -> None:
-    a, b = native(3), reference(3, AutoresetMode.NEXT_STEP)
+def test_reset_in_mid_episode_goes_on_with_the_generators(env_id: str) -> None:
+    a, b = native(env_id, 3), reference(env_id, 3, AutoresetMode.NEXT_STEP)
     for seed in (3, None, [9, None, 1], None):
         assert_same(a.reset(seed=seed), b.reset(seed=seed))
         action = a.action_space.sample()
         assert_same(a.step(action), b.step(action))
 
 
-def test_masked_reset_with_seeds_touches_only_its_rows() -> None:
-    a, b = native(4, AutoresetMode.DISABLED), reference(4, AutoresetMode.DISABLED)
+def test_masked_reset_with_seeds_touches_only_its_rows(env_id: str) -> None:
+    a, b = native(env_id, 4, AutoresetMode.DISABLED), reference(env_id, 4, AutoresetMode.DISABLED)
     mask = np.array([True, False, False, True])
     assert_same(a.reset(seed=0), b.reset(seed=0))
     for seed in (100, [5, 6, 7, 8], None):
@@ -105,18 +112,18 @@ def test_masked_reset_with_seeds_touches_only_its_rows() -> None:
         assert_same(a.reset(), b.reset())
 
 
-def test_unseeded_resets_differ() -> None:
-    first, second = (native(2).reset()[0]["desired_goal"] for _ in range(2))
+def test_unseeded_resets_differ(env_id: str) -> None:
+    first, second = (native(env_id, 2).reset()[0]["desired_goal"] for _ in range(2))
     assert not np.isin(first, second).any()
 
 
-def test_rows_do_not_depend_on_the_batch() -> None:
-    """Row 7 of 1,000 drives as it does alone: no draw and no rounding depends on the company."""
-    big, one = native(1000), native(1)
+def test_rows_do_not_depend_on_the_batch(env_id: str) -> None:
+    """Row 7 of 1,000 does what it does alone: no draw and no rounding depends on the company."""
+    big, one = native(env_id, 1000), native(env_id, 1)
     big_obs, one_obs = big.reset(seed=50)[0], one.reset(seed=57)[0]
-    rng = np.random.default_rng(0)
-    for _ in range(60):
-        action = towards_goal(big_obs, rng)
+    big.action_space.seed(0)
+    for _ in range(20):
+        action = big.action_space.sample()
         big_obs, big_reward, *_, big_info = big.step(action)
         one_obs, one_reward, *_, one_info = one.step(action[7:8])
         assert_same({k: v[7:8] for k, v in big_obs.items()}, one_obs)
@@ -125,9 +132,12 @@ def test_rows_do_not_depend_on_the_batch() -> None:
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_nothing_handed_out_is_written_to_later_or_shared(mode: AutoresetMode) -> None:
+def test_nothing_handed_out_is_written_to_later_or_shared(env_id: str, mode: AutoresetMode) -> None:
     """What was returned stays as it was; and scribbling over it does not change the episode."""
-    kept, scribbled = native(4, mode, max_episode_steps=6), native(4, mode, max_episode_steps=6)
+    kept, scribbled = (
+        native(env_id, 4, mode, max_episode_steps=6),
+        native(env_id, 4, mode, max_episode_steps=6),
+    )
     history = []
     out_a, out_b = kept.reset(seed=1), scribbled.reset(seed=1)
     for t in range(20):
@@ -161,25 +171,24 @@ def scribble(nested: Any) -> None:
         array[...] = True if array.dtype == bool else 77
 
 
-@pytest.mark.parametrize(
-    ("action", "message"),
-    [
-        (np.zeros((2, 2)), "shape"),
-        (np.full((3, 2), np.nan), "finite"),
-        ([["a", "b"]] * 3, "numeric"),
-    ],
-)
-def test_invalid_actions_leave_the_state(action: Any, message: str) -> None:
-    a, b = native(3), native(3)
+def test_invalid_actions_leave_the_state(env_id: str) -> None:
+    a, b = native(env_id, 3), native(env_id, 3)
     a.reset(seed=0), b.reset(seed=0)
-    with pytest.raises(ValueError, match=message):
-        a.step(action)
+    shape = a.action_space.shape
+    wrong = (
+        (np.zeros((2, shape[1])), "shape"),
+        (np.full(shape, np.nan), "finite"),
+        (np.full(shape, "a"), "numeric"),
+    )
+    for action, message in wrong:
+        with pytest.raises(ValueError, match=message):
+            a.step(action)
     good = a.action_space.sample()
     assert_same(a.step(good), b.step(good))
 
 
-def test_errors_of_use() -> None:
-    env = native(3, AutoresetMode.DISABLED, max_episode_steps=2)
+def test_errors_of_use(env_id: str) -> None:
+    env = native(env_id, 3, AutoresetMode.DISABLED, max_episode_steps=2)
     with pytest.raises(gym.error.ResetNeeded, match="reset"):
         env.step(env.action_space.sample())
     some = np.array([True, False, False])
@@ -200,8 +209,8 @@ def test_errors_of_use() -> None:
     env.step(action)
 
 
-def test_a_refused_reset_changes_nothing() -> None:
-    a, b = native(3), native(3)
+def test_a_refused_reset_changes_nothing(env_id: str) -> None:
+    a, b = native(env_id, 3), native(env_id, 3)
     a.reset(seed=0), b.reset(seed=0)
     for seed in ([1, 2], [5, 6, -1]):
         with pytest.raises((ValueError, gym.error.Error)):
@@ -209,21 +218,42 @@ def test_a_refused_reset_changes_nothing() -> None:
     assert_same(a.reset(), b.reset())
 
 
-def test_constructor_checks() -> None:
-    with pytest.raises(ValueError, match="not drawn"):
-        GroundVehicleVectorEnv(2, render_mode="rgb_array")
-    with pytest.raises(ValueError, match="num_envs"):
-        GroundVehicleVectorEnv(0)
-    with pytest.raises(ValueError, match="Sometimes"):
-        GroundVehicleVectorEnv(2, autoreset_mode="Sometimes")
-    with pytest.raises(ValueError, match="reward_type"):
-        GroundVehicleVectorEnv(2, reward_type="shaped")
+@pytest.mark.parametrize(
+    ("n", "kwargs", "message"),
+    [
+        (2, {"render_mode": "rgb_array"}, "draw"),
+        (0, {}, "num_envs"),
+        (2, {"mode": "Sometimes"}, "Sometimes"),
+        (2, {"reward_type": "shaped"}, "reward_type"),
+        (2, {"max_episode_steps": 0}, "max_episode_steps"),
+    ],
+    ids=str,
+)
+def test_constructor_checks(env_id: str, n: int, kwargs: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        native(env_id, n, **kwargs)
 
 
-def test_declares_its_autoreset_mode_and_closes_twice() -> None:
+def test_declares_its_autoreset_mode_and_closes_twice(env_id: str) -> None:
     for mode in MODES:
-        env = native(2, mode)
+        env = native(env_id, 2, mode)
         assert env.metadata["autoreset_mode"] is mode
         env.close()
         env.close()
-    assert GroundVehicleVectorEnv.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    module, _, name = ENVS[env_id][1].partition(":")  # type: ignore[union-attr]
+    assert (
+        getattr(importlib.import_module(module), name).metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    )
+
+
+def test_the_spaces_hold_one_rows_bounds_only(env_id: str) -> None:
+    """They equal Gymnasium's, whose bounds take as much memory as all the rest."""
+    env = native(env_id, 100)
+    for space, single in (
+        (env.observation_space, env.single_observation_space),
+        (env.action_space, env.single_action_space),
+    ):
+        assert space == batch_space(single, 100)
+        assert space.contains(space.sample())
+    boxes = [*env.observation_space.values(), env.action_space]
+    assert all(box.low.strides[0] == box.high.strides[0] == 0 for box in boxes)
