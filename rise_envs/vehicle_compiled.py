@@ -9,6 +9,7 @@ Shapes: B batch, N discs.
 from __future__ import annotations
 
 import functools
+import itertools
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +38,7 @@ Whole = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
 LANES = 16
+_LARGE = 4_096  # rows
 _row = np.uintp  # a row's number as the compiler likes it: one that cannot count from the end
 _X, _Y, _THETA, _V, _OMEGA, _GX, _GY, _PX, _PY, _VX, _VY, _RADIUS, _LEAST = range(13)
 
@@ -212,6 +214,22 @@ def _advance(
             truncated[b] = time[b] >= limit
 
 
+def _outcome(b_count: int, n_count: int) -> Outcome:
+    """An outcome to be filled in.
+
+    Of many large pieces of memory the system takes some back after every step, which costs as much as the step
+    itself: those of a large batch are parts of one.
+    """
+    widths, flags = (3, 2, 2, 5 * n_count, 2), np.empty((3, b_count), np.bool_)
+    if b_count < _LARGE:
+        tables = [np.empty((b_count, width)) for width in widths]
+        return Outcome(*tables, *(np.empty(b_count) for _ in range(3)), *flags)
+    floats = np.empty((sum(widths) + 3) * b_count)
+    *ends, _ = (b_count * total for total in itertools.accumulate((*widths, 1, 1, 1)))
+    parts = np.split(floats, ends)
+    return Outcome(*(part.reshape(b_count, -1) for part in parts[:5]), *parts[5:], *flags)
+
+
 def advance(
     world: World, action: Array, c: Constants, limit: int, on_collision: bool, threads: int = 1
 ) -> Outcome:
@@ -225,15 +243,12 @@ def advance(
         on_collision: whether an overlap terminates the episode.
         threads: that share the rows.
     """
-    b_count, n_count, _ = world.disc.shape
-    widths = (3, 2, 2, 5 * n_count, 2)
-    parts = [np.empty((b_count, width)) for width in widths] + [np.empty(b_count) for _ in range(3)]
-    shown = Outcome(*parts, *(np.empty(b_count, np.bool_) for _ in range(3)))
+    shown = _outcome(*world.disc.shape[:2])
     arguments = (
         *(world.state, world.goal, world.disc, world.key, world.step, action, packed(c), limit, on_collision),
         *(*shown[:3], shown.obstacle.reshape(world.disc.shape), *shown[4:]),
     )
-    shared.run(lambda first, last: _advance(first, last, *arguments), b_count, LANES, threads)
+    shared.run(lambda first, last: _advance(first, last, *arguments), len(action), LANES, threads)
     return shown
 
 
