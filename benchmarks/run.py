@@ -20,7 +20,7 @@ from rise_agents.cli import Parser, prepare_folder
 
 _EXAMPLES = """\
 examples:
-  python -m benchmarks.run --agents rise pcbc cppo                    both tasks, 1,000 scenarios, about 15 minutes
+  python -m benchmarks.run --agents rise pcbc cppo                    both tasks, 1,000 scenarios, about 8 minutes
   python -m benchmarks.run --agents rise pcbc --envs RISE-GroundVehicle-v0 --noise-model episode
   python -m benchmarks.run --agents expert random --noise-levels 0    what the experts reach on true readings
   python -m benchmarks.run --agents rise --set rise.beta=0.1 --out runs/beta-0.1
