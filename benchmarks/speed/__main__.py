@@ -18,7 +18,7 @@ _EXAMPLES = """\
 examples:
   python -m benchmarks.speed                              every row and the figure, about four minutes
   python -m benchmarks.speed --rows vehicles panda        two rows
-  python -m benchmarks.speed --bench-times                and the whole benchmark, cold and warm: half an hour
+  python -m benchmarks.speed --bench-times                and the whole benchmark, cold and warm: ten minutes more
   python -m benchmarks.speed --docs docs/performance.md   measure, then renew the table and figure of the page
   python -m benchmarks.speed --docs docs/performance.md --render   the same from the last measurement
 
@@ -73,10 +73,9 @@ def measure_all(names: Sequence[str], arguments: argparse.Namespace, out: Path) 
     from benchmarks.speed import measure, page, throughput
     from benchmarks.speed.rows import ROWS
 
-    seconds = 0.01 if arguments.quick else 0.25
-    effort = measure.Effort(
-        min(arguments.repeats, 2) if arguments.quick else arguments.repeats, seconds, arguments.quick
-    )
+    quick = arguments.quick
+    repeats = min(arguments.repeats, 2) if quick else arguments.repeats
+    effort = measure.Effort(repeats, 0.01 if quick else 0.25, quick, out)
     results: list[measure.Result] = []
     wrong: list[str] = []
     with Display() as display:

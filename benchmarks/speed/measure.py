@@ -29,11 +29,13 @@ class Effort:
         repeats: measurements of each side.
         seconds: the least duration of one.
         quick: small sizes, for a pass that only shows that everything runs.
+        folder: for what a row leaves behind.
     """
 
     repeats: int = 7
     seconds: float = 0.25
     quick: bool = False
+    folder: Path = Path("runs/speed")
 
     def size(self, full: int, quick: int) -> int:
         """How large something is made."""

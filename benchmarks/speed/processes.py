@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -104,19 +105,19 @@ def noted(output: Path, progress: Any, run: Callable[..., None], arguments: dict
 
 @contextmanager
 def bench(effort: Effort, cold: bool) -> Iterator[Sides]:
-    """The whole quick benchmark from nothing, or once more in the same folder."""
-    yield Sides(lambda: bench_seconds(effort.quick)[0 if cold else 1])
+    """The whole quick benchmark from nothing, or once more in the same folder; what it made stays there."""
+    yield Sides(lambda: bench_seconds(effort.folder / "bench", effort.quick)[0 if cold else 1])
 
 
 @functools.cache
-def bench_seconds(quick: bool) -> tuple[float, float]:
+def bench_seconds(folder: Path, quick: bool) -> tuple[float, float]:
     """Seconds that the benchmark takes the first time, and the second time in the same folder."""
-    with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "benchmarks.run", "--agents", "rise", "pcbc", "cppo"]
-        command += ["--preset", "smoke" if quick else "quick", "--out", folder]
-        seconds = []
-        for _ in range(2):
-            started = time.perf_counter()
-            subprocess.run(command, check=True, stdout=subprocess.DEVNULL)  # noqa: S603
-            seconds.append(time.perf_counter() - started)
+    shutil.rmtree(folder, ignore_errors=True)
+    command = [sys.executable, "-m", "benchmarks.run", "--agents", "rise", "pcbc", "cppo"]
+    command += ["--preset", "smoke" if quick else "quick", "--out", str(folder)]
+    seconds = []
+    for _ in range(2):
+        started = time.perf_counter()
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)  # noqa: S603
+        seconds.append(time.perf_counter() - started)
     return seconds[0], seconds[1]
