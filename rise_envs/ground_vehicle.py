@@ -14,14 +14,17 @@ from rise_envs import goals
 from rise_envs.actions import finite_action
 from rise_envs.episodes import EpisodeStreams
 from rise_envs.task import Task
+from rise_envs.vehicle_dynamics import packed
 from rise_envs.vehicle_world import Array, Params, World, sample_starts
 
 DEFAULTS = Params()
 
 
 def _pose(state: Array) -> tuple[Array, Array]:
-    cos, sin = np.cos(state[..., 2]), np.sin(state[..., 2])
-    return state[..., :2], np.stack((np.stack((cos, -sin), -1), np.stack((sin, cos), -1)), -2)
+    rotation, sin = np.empty((*state.shape[:-1], 2, 2)), np.sin(state[..., 2])
+    rotation[..., 0, 0] = rotation[..., 1, 1] = np.cos(state[..., 2])
+    rotation[..., 1, 0], rotation[..., 0, 1] = sin, -sin
+    return state[..., :2], rotation
 
 
 def make_spaces(n_obstacles: int, p: Params) -> tuple[spaces.Dict, spaces.Box]:
@@ -174,7 +177,7 @@ class GroundVehicleEnv(VehicleTask, gym.Env):
         self.perceived: Array | None = None
         from rise_envs import vehicle_compiled  # numba is loaded by those who drive only
 
-        self._dynamics, self._numbers = vehicle_compiled, vehicle_compiled.packed(self.constants)
+        self._dynamics, self._numbers = vehicle_compiled, packed(self.constants)
         self._streams = EpisodeStreams(1)
         self._key = self._time = 0
         self._now: Array | None = None  # x, y, θ, goal, and the reading of each disc

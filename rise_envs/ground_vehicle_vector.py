@@ -10,11 +10,10 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
-from rise_envs.arithmetic import to_float
 from rise_envs.episodes import EpisodeStreams, Seeds, check_running, reset_mask, space_of_many
 from rise_envs.ground_vehicle import DEFAULTS, VehicleTask, make_spaces
 from rise_envs.vehicle_backend import choose
-from rise_envs.vehicle_world import Outcome, Params, World, copied, sample_starts
+from rise_envs.vehicle_world import Outcome, Params, World, copied
 
 Array = Any  # of NumPy or torch
 Infos = dict[str, Any]
@@ -100,56 +99,41 @@ class GroundVehicleVectorEnv(VehicleTask, VectorEnv):
         """
         mask = reset_mask(options, self.num_envs, first=self._world is None)
         self._streams.seed(seed, mask)
-        rows = self._backend.own(np.flatnonzero(mask))
-        clearance = self._start(rows)
-        shown = self._fresh(rows, clearance)
+        before, self._world = self._world, self._world or self._nowhere()
+        try:
+            shown = self._start(self._backend.own(np.flatnonzero(mask)))
+        except ValueError:
+            self._world = before
+            raise
         infos = self._infos(shown)
         return self._observation(shown), infos | self._masks(infos, mask)
 
-    def _start(self, rows: Array) -> Array:
-        """Start the next episodes of ``rows`` (indices): their clearances."""
-        base, number = self._streams.next(rows)
-        fresh, clearance = sample_starts(
-            base, number, self.n_obstacles, self.constants, self._backend.dynamics
-        )
-        if len(rows) == self.num_envs:
-            self._world = fresh
-        else:
-            for name, array in vars(self.world).items():
-                array[rows] = getattr(fresh, name)
+    def _nowhere(self) -> World:
+        """A world that is still to be filled in."""
+        n, own = self.num_envs, self._backend.own
+        tables = (own(np.zeros((n, *shape))) for shape in ((3,), (2,), (self.n_obstacles, 5)))
+        return World(*tables, *(own(np.zeros(n, np.int64)) for _ in range(2)))
+
+    def _start(self, rows: Array, shown: Outcome | None = None) -> Outcome:
+        """Start the next episodes of ``rows`` (indices), and let ``shown`` tell of them.
+
+        Without it: what there is to see in all rows, with infos that are zero in the others.
+        """
+        w = self.world
+        if shown is None:
+            nothing = w.state[:, 0] * 0.0
+            shown = Outcome(
+                state=copied(w.state),
+                achieved=copied(w.state[:, :2]),
+                goal=copied(w.goal),
+                obstacle=copied(w.disc).reshape(self.num_envs, -1),
+                previous=w.state[:, :2] * 0.0,
+                **{name: copied(nothing) for name in ("clearance", "cost", "reward")},
+                **{name: nothing > 0.0 for name in ("reached", "terminated", "truncated")},
+            )
+        self._backend.dynamics.restart(w, shown, rows, *self._streams.next(rows), self.constants)
         self._done[rows] = False
-        return clearance
-
-    def _fresh(self, rows: Array, clearance: Array) -> Outcome:
-        """What is shown after episodes have started in ``rows``; infos are zero elsewhere."""
-        w = self.world
-        nothing = w.state[:, 0] * 0.0
-        shown = Outcome(
-            state=copied(w.state),
-            achieved=copied(w.state[:, :2]),
-            goal=copied(w.goal),
-            obstacle=copied(w.disc).reshape(self.num_envs, -1),
-            previous=w.state[:, :2] * 0.0,
-            **{name: copied(nothing) for name in ("clearance", "cost", "reward")},
-            **{name: nothing > 0.0 for name in ("reached", "terminated", "truncated")},
-        )
-        self._write_start(shown, rows, clearance)
         return shown
-
-    def _write_start(self, shown: Outcome, rows: Array, clearance: Array) -> None:
-        """Let ``shown`` tell of episodes that have just started in ``rows``."""
-        w = self.world
-        shown.state[rows], shown.goal[rows] = w.state[rows], w.goal[rows]
-        shown.achieved[rows] = shown.previous[rows] = w.state[rows, :2]
-        shown.obstacle[rows] = w.disc[rows].reshape(len(rows), -1)
-        shown.clearance[rows], shown.cost[rows], shown.reward[rows] = (
-            clearance,
-            to_float(clearance < 0.0),
-            0.0,
-        )
-        shown.reached[rows] = shown.terminated[rows] = shown.truncated[rows] = (
-            False  # no start is at its goal
-        )
 
     def step(self, actions: Array) -> tuple[dict[str, Array], Array, Array, Array, Infos]:
         """Drive all vehicles for one step.
@@ -172,8 +156,7 @@ class GroundVehicleVectorEnv(VehicleTask, VectorEnv):
             backend.threads,
         )
         if restart:  # with NEXT_STEP these start anew now, instead of moving
-            rows = _indices(self._done)
-            self._write_start(shown, rows, self._start(rows))
+            self._start(_indices(self._done), shown)
         self._done = shown.terminated | shown.truncated
         infos = self._infos(shown)
         infos |= self._masks(infos)
@@ -211,7 +194,7 @@ class GroundVehicleVectorEnv(VehicleTask, VectorEnv):
         """Start the ended episodes at once: their first observations. ``infos`` receives their last."""
         ended, give = copied(self._done), self._backend.give
         rows = _indices(ended)
-        first = self._fresh(rows, self._start(rows))
+        first = self._start(rows)
         final: Infos = {}
         for name, fresh in self._infos(first).items():
             final[name], final[f"_{name}"] = copied(infos[name]), give(copied(ended))

@@ -24,7 +24,7 @@ from rise_envs.vehicle_dynamics import (
     reward,
     swept_clearance,
 )
-from rise_envs.vehicle_world import Outcome, World, copied
+from rise_envs.vehicle_world import Outcome, World, check_fair, copied
 
 Array = Any
 
@@ -108,3 +108,15 @@ def begin(
     px, py, radius = discs
     clearance = array_namespace(state).min(gap(x, y, px, py) - radius - c.robot_radius, axis=-1)
     return state, goal, disc, split(keys, 1), clearance, bool(valid.all())
+
+
+def restart(world: World, shown: Outcome, rows: Array, base: Array, number: Array, c: Constants) -> None:
+    """Start episodes in some rows, in place: see :func:`rise_envs.vehicle_compiled.restart`."""
+    state, goal, disc, key, clearance, fair = begin(base, number, world.disc.shape[1], c)
+    check_fair(fair, world.disc.shape[1], c)
+    world.state[rows], world.goal[rows], world.disc[rows], world.key[rows] = state, goal, disc, key
+    world.step[rows] = 0
+    shown.state[rows], shown.goal[rows], shown.obstacle[rows] = state, goal, disc.reshape(len(rows), -1)
+    shown.achieved[rows] = shown.previous[rows] = state[:, :2]
+    shown.clearance[rows], shown.cost[rows], shown.reward[rows] = clearance, to_float(clearance < 0.0), 0.0
+    shown.reached[rows] = shown.terminated[rows] = shown.truncated[rows] = False  # no start is at its goal

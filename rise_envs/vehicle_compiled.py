@@ -1,37 +1,37 @@
 """The batched vehicle, compiled: the dynamics of :mod:`rise_envs.vehicle_dynamics` on one CPU core.
 
 Blocks of ``LANES`` vehicles are copied into rows of a scratch array, so that each loop over them becomes vector
-instructions, and back. A block that is not full is filled up with copies of its last vehicle.
+instructions, and back. A block that is not full is filled up with copies of its last vehicle. Episodes start in
+:mod:`rise_envs.vehicle_starts`.
 
 Shapes: B batch, N discs.
 """
 
 from __future__ import annotations
 
-import functools
 import itertools
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rise_envs import shared
-from rise_envs.arithmetic import mix, split, to_float, where
+from rise_envs.arithmetic import to_float, where
 from rise_envs.compiled import compiled, inlined
-from rise_envs.obstacles import DRAWS, Rules, next_velocity
+from rise_envs.obstacles import DRAWS, next_velocity
 from rise_envs.vehicle_dynamics import (
-    DISC_DRAWS,
-    MAX_ATTEMPTS,
-    PLACE_DRAWS,
     Constants,
     clipped,
     drive,
     gap,
-    placed,
-    placed_disc,
+    packed,
     reward,
     swept_clearance,
+    unpacked,
 )
+from rise_envs.vehicle_starts import begin, restart
 from rise_envs.vehicle_world import Outcome, World
+
+__all__ = ["advance", "begin", "restart", "step_alone"]
 
 Array = NDArray[np.float64]
 Whole = NDArray[np.int64]
@@ -41,41 +41,6 @@ LANES = 16
 _LARGE = 4_096  # rows
 _row = np.uintp  # a row's number as the compiler likes it: one that cannot count from the end
 _X, _Y, _THETA, _V, _OMEGA, _GX, _GY, _PX, _PY, _VX, _VY, _RADIUS, _LEAST = range(13)
-
-
-@functools.cache
-def packed(c: Constants) -> Array:
-    """The constants as one array: unlike a tuple, compiled code takes it as an argument in no time."""
-    numbers: list[float] = []
-    for value in (*c[:-2], *c.rules, c.sparse):
-        numbers += value if isinstance(value, tuple) else [value]
-    return np.array(numbers, float)
-
-
-@compiled
-def unpacked(n: Array) -> Constants:
-    """The inverse of `packed`."""
-    rules = Rules(n[18], n[19], n[20], (n[21], n[22], n[23]), (n[24], n[25], n[26]), n[27], n[28] > 0.0)
-    goal_distance, obstacle_radius, obstacle_along = (n[8], n[9]), (n[11], n[12]), (n[13], n[14])
-    return Constants(
-        n[0],
-        n[1],
-        n[2],
-        n[3],
-        n[4],
-        n[5],
-        n[6],
-        n[7],
-        goal_distance,
-        n[10],
-        obstacle_radius,
-        obstacle_along,
-        n[15],
-        n[16],
-        n[17],
-        rules,
-        n[29] > 0.0,
-    )
 
 
 @compiled
@@ -119,6 +84,14 @@ def step_alone(
     now[0], now[1], now[2] = x, y, theta
     shown[0], shown[1], shown[2], shown[3], shown[4] = x, y, theta, x, y
     return least, reward(before, after, reached, c), reached
+
+
+@inlined
+def aligned(rows: int) -> Array:
+    """Scratch (rows, LANES) that begins at a line of the cache: no vector of a row lies across two."""
+    room = np.empty(rows * LANES + 8)
+    first = -(room.ctypes.data // 8) % 8
+    return room[first : first + rows * LANES].reshape((rows, LANES))
 
 
 @inlined
@@ -178,7 +151,7 @@ def _advance(
     truncated: Flags,
 ) -> None:
     """Rows ``first`` to ``last`` of `advance`; from ``seen`` on the parts of the outcome."""
-    c, w = unpacked(numbers), np.empty((13, LANES))
+    c, w = unpacked(numbers), aligned(13)
     for start in range(first, last, LANES):
         count = min(LANES, last - start)
         for m in range(LANES):
@@ -250,41 +223,3 @@ def advance(
     )
     shared.run(lambda first, last: _advance(first, last, *arguments), len(action), LANES, threads)
     return shown
-
-
-@compiled
-def begin(
-    base: Whole, number: Whole, n_count: int, c: Constants
-) -> tuple[Array, Array, Array, Whole, Array, bool]:
-    """Fair starts of the episodes with the given numbers of streams with the given bases, (B,) each.
-
-    Returns:
-        States, goals, discs, keys of the discs' motion, clearances (B,), and whether all are fair.
-    """
-    b_count = len(base)
-    state, goal, disc = np.empty((b_count, 3)), np.empty((b_count, 2)), np.empty((b_count, n_count, 5))
-    size = PLACE_DRAWS + DISC_DRAWS * n_count
-    motion, clearance = np.empty(b_count, np.int64), np.empty(b_count)
-    for b in range(b_count):
-        key = mix(base[b], number[b])
-        draws, motion[b] = split(key, 0), split(key, 1)
-        for attempt in range(MAX_ATTEMPTS):
-            x, y, theta, gx, gy, distance, cos, sin, valid = placed(draws, attempt * size, c)
-            least = np.inf
-            for n in range(n_count):
-                if not valid:
-                    break
-                counter = attempt * size + PLACE_DRAWS + DISC_DRAWS * n
-                px, py, u, v, r, valid = placed_disc(
-                    draws, counter, (x, y), (gx, gy), (distance, cos, sin), c
-                )
-                disc[b, n, 0], disc[b, n, 1], disc[b, n, 2], disc[b, n, 3], disc[b, n, 4] = px, py, u, v, r
-                near = gap(x, y, px, py) - r - c.robot_radius
-                least = where(near < least, near, least)
-            if valid:
-                break
-        else:
-            return state, goal, disc, motion, clearance, False
-        state[b, 0], state[b, 1], state[b, 2], goal[b, 0], goal[b, 1] = x, y, theta, gx, gy
-        clearance[b] = least
-    return state, goal, disc, motion, clearance, True

@@ -7,13 +7,19 @@ and agree to the last bit.
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from rise_envs.arithmetic import Number, arc, sincos, sqrt, to_float, uniform, where, wrap_angle
 from rise_envs.obstacles import DRAWS, Rules, drawn_velocity, kept, outside
 
 Pose = tuple[Number, Number, Number]  # x, y (m), θ (rad)
 Disc = tuple[Number, Number, Number, Number, Number]  # px, py (m), vx, vy (m/s), r (m)
+
+Array = NDArray[np.float64]
 
 HALF_PI = 1.5707963267948966
 PLACE_DRAWS = 5  # numbers that a start of the vehicle takes
@@ -41,6 +47,40 @@ class Constants(NamedTuple):
     start_horizon: float
     rules: Rules
     sparse: bool  # the reward
+
+
+@functools.cache
+def packed(c: Constants) -> Array:
+    """The constants as one array: unlike a tuple, compiled code takes it as an argument in no time."""
+    numbers: list[float] = []
+    for value in (*c[:-2], *c.rules, c.sparse):
+        numbers += value if isinstance(value, tuple) else [value]
+    return np.array(numbers, float)
+
+
+def unpacked(n: Array) -> Constants:
+    """The inverse of `packed`."""
+    rules = Rules(n[18], n[19], n[20], (n[21], n[22], n[23]), (n[24], n[25], n[26]), n[27], n[28] > 0.0)
+    goal_distance, obstacle_radius, obstacle_along = (n[8], n[9]), (n[11], n[12]), (n[13], n[14])
+    return Constants(
+        n[0],
+        n[1],
+        n[2],
+        n[3],
+        n[4],
+        n[5],
+        n[6],
+        n[7],
+        goal_distance,
+        n[10],
+        obstacle_radius,
+        obstacle_along,
+        n[15],
+        n[16],
+        n[17],
+        rules,
+        n[29] > 0.0,
+    )
 
 
 def clipped(x: Number, low: float, high: float) -> Number:

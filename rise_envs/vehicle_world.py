@@ -139,11 +139,16 @@ def sample_starts(
         ValueError: the parameters leave no room for a fair start.
     """
     state, goal, disc, motion, clearance, fair = dynamics.begin(base, number, n_obstacles, constants)
+    check_fair(fair, n_obstacles, constants)
+    return World(state, goal, disc, motion, motion * 0), clearance
+
+
+def check_fair(fair: bool, n_obstacles: int, constants: Constants) -> None:
+    """Raise ``ValueError`` if no fair start was found."""
     if not fair:
         raise ValueError(
             f"no fair start in {MAX_ATTEMPTS} draws for n_obstacles={n_obstacles} and {constants}"
         )
-    return World(state, goal, disc, motion, motion * 0), clearance
 
 
 def observe(world: World) -> dict[str, Any]:

@@ -11,7 +11,8 @@ import pytest
 import torch
 from numba import njit
 
-from rise_envs import arithmetic, compiled, streams, vehicle_compiled
+from rise_envs import arithmetic, compiled, streams
+from rise_envs.vehicle_dynamics import packed, unpacked
 from rise_envs.vehicle_world import Params
 
 RNG = np.random.default_rng(0)
@@ -94,4 +95,4 @@ def test_numpy_torch_and_compiled_code_agree_to_the_last_bit(name: str) -> None:
 def test_constants_survive_packing() -> None:
     for sparse in (False, True):
         constants = Params(v_min=-0.5).constants(sparse)
-        assert vehicle_compiled.unpacked(vehicle_compiled.packed(constants)) == constants
+        assert unpacked(packed(constants)) == constants

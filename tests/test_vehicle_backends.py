@@ -17,6 +17,7 @@ from rise_agents.demonstrations import generate
 from rise_envs import shared
 from rise_envs.noise import NOISE_MODELS
 from rise_envs.noise_wrappers import VectorObservationNoise
+from rise_envs.vehicle_world import Params
 
 ID = "RISE-GroundVehicle-v0"
 OTHERS = {
@@ -139,6 +140,15 @@ def test_unknown_backends_and_devices_are_named() -> None:
         make(backend="torch", device="meta", compiled=True)
     with pytest.raises(ValueError, match="nowhere"):
         make(backend="torch", device="nowhere")
+
+
+@pytest.mark.parametrize("other", [{}, *OTHERS.values()], ids=["NumPy", *OTHERS])
+def test_parameters_without_room_are_refused_and_nothing_has_started(other: dict) -> None:
+    env = make(3, params=Params(start_margin=30.0), **other)
+    with pytest.raises(ValueError, match="no fair start"):
+        env.reset(seed=0)
+    with pytest.raises(gym.error.ResetNeeded):
+        env.step(np.zeros((3, 2)))
 
 
 @pytest.mark.parametrize("noise", [*NOISE_MODELS, "step+dropout:0.3+delay:2"])
