@@ -131,7 +131,9 @@ class GroundVehicleVectorEnv(VehicleTask, VectorEnv):
                 **{name: copied(nothing) for name in ("clearance", "cost", "reward")},
                 **{name: nothing > 0.0 for name in ("reached", "terminated", "truncated")},
             )
-        self._backend.dynamics.restart(w, shown, rows, *self._streams.next(rows), self.constants)
+        base, number = self._streams.next(rows)
+        backend = self._backend
+        backend.dynamics.restart(w, shown, rows, base, number, self.constants, backend.threads)
         self._done[rows] = False
         return shown
 

@@ -6,8 +6,9 @@ import functools
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
 
-_LEAST = 4_096  # rows that are worth a thread: waking one takes as long as some hundred vehicles
+T = TypeVar("T")
 
 
 @functools.cache
@@ -19,19 +20,24 @@ if hasattr(os, "register_at_fork"):  # a child process has none of its parent's 
     os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
-def run(work: Callable[[int, int], None], rows: int, block: int, threads: int) -> None:
-    """Call ``work(first, last)`` so that all ``rows`` are covered, by several threads where it pays.
+def run(work: Callable[[int, int], T], rows: int, threads: int, piece: int) -> list[T]:
+    """Call ``work(first, last)`` so that all ``rows`` are covered, on several threads if there are several pieces.
 
     Args:
         work: releases the interpreter's lock; writes to its own rows only.
         rows: how many there are.
-        block: pieces begin at multiples of it.
-        threads: at most; this one is among them.
+        threads: at most; this one is among them. Each takes the next piece when it is done with one, so that
+            none waits for another that the system has slowed down.
+        piece: rows of one call, worth the waking of a thread.
+
+    Returns:
+        What the pieces gave, in no order.
     """
-    pieces = max(1, min(threads, rows // _LEAST))
-    size = -(-rows // (pieces * block)) * block
-    begins = range(0, rows, size)
-    others = [_pool(threads).submit(work, at, min(at + size, rows)) for at in begins[1:]]
-    work(0, min(size, rows))
-    for other in others:
-        other.result()
+    begins = iter(range(0, rows, piece))  # its next() is one step of the interpreter: no piece is taken twice
+
+    def share() -> list[T]:
+        return [work(first, min(first + piece, rows)) for first in begins]
+
+    helpers = min(threads, -(-rows // piece)) - 1
+    others = [_pool(threads).submit(share) for _ in range(helpers)]
+    return sum((other.result() for other in others), share())

@@ -110,7 +110,9 @@ def begin(
     return state, goal, disc, split(keys, 1), clearance, bool(valid.all())
 
 
-def restart(world: World, shown: Outcome, rows: Array, base: Array, number: Array, c: Constants) -> None:
+def restart(
+    world: World, shown: Outcome, rows: Array, base: Array, number: Array, c: Constants, threads: int = 1
+) -> None:
     """Start episodes in some rows, in place: see :func:`rise_envs.vehicle_compiled.restart`."""
     state, goal, disc, key, clearance, fair = begin(base, number, world.disc.shape[1], c)
     check_fair(fair, world.disc.shape[1], c)

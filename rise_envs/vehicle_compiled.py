@@ -39,6 +39,7 @@ Flags = NDArray[np.bool_]
 
 LANES = 16
 _LARGE = 4_096  # rows
+_PIECE = 256 * LANES  # rows that one thread takes at a time: waking it takes as long as some hundred
 _row = np.uintp  # a row's number as the compiler likes it: one that cannot count from the end
 _X, _Y, _THETA, _V, _OMEGA, _GX, _GY, _PX, _PY, _VX, _VY, _RADIUS, _LEAST = range(13)
 
@@ -221,5 +222,5 @@ def advance(
         *(world.state, world.goal, world.disc, world.key, world.step, action, packed(c), limit, on_collision),
         *(*shown[:3], shown.obstacle.reshape(world.disc.shape), *shown[4:]),
     )
-    shared.run(lambda first, last: _advance(first, last, *arguments), len(action), LANES, threads)
+    shared.run(lambda first, last: _advance(first, last, *arguments), len(action), threads, _PIECE)
     return shown

@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from rise_envs import shared
 from rise_envs.arithmetic import mix, split, to_float, where
 from rise_envs.compiled import compiled, inlined
 from rise_envs.vehicle_dynamics import (
@@ -26,6 +27,8 @@ from rise_envs.vehicle_world import Outcome, World, check_fair
 Array = NDArray[np.float64]
 Whole = NDArray[np.int64]
 Flags = NDArray[np.bool_]
+
+_PIECE = 256  # rows that one thread takes at a time
 
 
 @inlined
@@ -78,6 +81,8 @@ def begin(
 
 @compiled
 def _restart(
+    first: int,
+    last: int,
     rows: Whole,
     base: Whole,
     number: Whole,
@@ -99,9 +104,13 @@ def _restart(
     terminated: Flags,
     truncated: Flags,
 ) -> bool:
-    """`restart`; from ``seen`` on the parts of the outcome. Whether all starts are fair."""
+    """Numbers ``first`` to ``last`` of `restart`; from ``seen`` on the parts of the outcome.
+
+    Returns:
+        Whether all starts are fair.
+    """
     c = unpacked(numbers)
-    for i in range(len(rows)):
+    for i in range(first, last):
         b = rows[i]
         x, y, theta, gx, gy, key[b], least = _begin(base[i], number[i], disc[b], c)
         if least == -np.inf:
@@ -115,7 +124,9 @@ def _restart(
     return True
 
 
-def restart(world: World, shown: Outcome, rows: Whole, base: Whole, number: Whole, c: Constants) -> None:
+def restart(
+    world: World, shown: Outcome, rows: Whole, base: Whole, number: Whole, c: Constants, threads: int = 1
+) -> None:
     """Start episodes in some rows, in place: of the world, and of what is shown.
 
     Args:
@@ -125,12 +136,14 @@ def restart(world: World, shown: Outcome, rows: Whole, base: Whole, number: Whol
         base: of the streams that they come from, (K,).
         number: of the episodes, (K,).
         c: the task.
+        threads: that share the rows.
 
     Raises:
         ValueError: the parameters leave no room for a fair start.
     """
-    fair = _restart(
+    arguments = (
         *(rows, base, number, packed(c), world.state, world.goal, world.disc, world.key, world.step),
         *(*shown[:3], shown.obstacle.reshape(world.disc.shape), *shown[4:]),
     )
-    check_fair(fair, world.disc.shape[1], c)
+    fair = shared.run(lambda first, last: _restart(first, last, *arguments), len(rows), threads, _PIECE)
+    check_fair(all(fair), world.disc.shape[1], c)

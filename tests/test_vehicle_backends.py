@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import threading
 from typing import Any
 
 import gymnasium as gym
@@ -194,21 +193,22 @@ def test_agents_act_on_tensors_as_on_arrays(name: str) -> None:
 def test_threads_cover_every_row_once(rows: int, threads: int) -> None:
     hits = np.zeros(rows, int)
 
-    def work(first: int, last: int) -> None:
-        assert first % 16 == 0
+    def work(first: int, last: int) -> int:
         hits[first:last] += 1
+        return first
 
-    shared.run(work, rows, 16, threads)
+    begins = shared.run(work, rows, threads, piece=4_096)
     assert (hits == 1).all()
+    assert sorted(begins) == list(range(0, rows, 4_096))
 
 
 def test_a_failing_piece_is_told() -> None:
     def work(first: int, last: int) -> None:
-        if first and threading.current_thread() is not threading.main_thread():
+        if first == 16_384:
             raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
-        shared.run(work, 20_000, 16, 2)
+        shared.run(work, 20_000, 2, piece=4_096)
 
 
 def test_threads_change_no_bit() -> None:

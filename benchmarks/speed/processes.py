@@ -50,7 +50,7 @@ def workers(effort: Effort) -> Iterator[Sides]:
         envs=(PANDA,),
         noise_model="step",
         noise_levels=(1.0,),
-        episodes=effort.size(400, 4),
+        episodes=effort.size(600, 4),
     )
     whole: dict[int, list[float]] = {1: [], 2: []}
 
