@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 
 
@@ -29,10 +29,10 @@ def finite_action(action: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
     return np.ascontiguousarray(array, dtype=np.float64)
 
 
-def checked_action(action: Any, space: spaces.Box) -> NDArray[np.float64]:
-    """``action`` as float64, clipped to the bounds of ``space``.
-
-    Raises:
-        ValueError: wrong shape, not numeric, or not finite. The environment's state is untouched.
-    """
-    return np.clip(finite_action(action, space.shape), space.low, space.high)
+def finite_numbers(action: Any, shape: tuple[int]) -> list[float]:
+    """The numbers of a single action; raises ``ValueError`` as `finite_action` does, and takes less time."""
+    if type(action) is np.ndarray and action.shape == shape and action.dtype.kind == "f":
+        numbers = action.tolist()
+        if all(map(math.isfinite, numbers)):
+            return numbers
+    return finite_action(action, shape).tolist()

@@ -6,6 +6,8 @@ The signatures are those of ``gymnasium_robotics.core.GoalEnv`` and accept singl
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -18,6 +20,21 @@ def distance(achieved_goal: NDArray, desired_goal: NDArray) -> NDArray:
     """Euclidean distance (m) over the last axis."""
     gap = np.subtract(achieved_goal, desired_goal)
     return np.sqrt(np.add.reduce(gap * gap, axis=-1))  # the bits of np.linalg.norm, at a third of its cost
+
+
+def gap(here: Sequence[float], there: Sequence[float]) -> float:
+    """`distance` of two points given as plain numbers, to the same bit, in no time."""
+    total = 0.0
+    for a, b in zip(here, there, strict=True):
+        total += (a - b) * (a - b)
+    return math.sqrt(total)
+
+
+def step_reward(before: float, after: float, reached: bool, goal_radius: float, reward_type: str) -> float:
+    """`reward` of a step that begins and ends at these distances from the goal (m), to the same bit."""
+    if reward_type == "sparse":
+        return reached - 1.0
+    return (before - after) * (1.0 / goal_radius) + reached
 
 
 def check_reward_type(reward_type: str) -> str:

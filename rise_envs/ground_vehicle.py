@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import gymnasium as gym
@@ -11,7 +10,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rise_envs import goals
-from rise_envs.actions import finite_action
+from rise_envs.actions import finite_numbers
 from rise_envs.episodes import EpisodeStreams
 from rise_envs.task import Task
 from rise_envs.vehicle_dynamics import packed
@@ -87,15 +86,6 @@ class VehicleTask:
     def compute_truncated(self, achieved_goal: Array, desired_goal: Array, info: Any) -> Any:
         """Never: the time limit truncates."""
         return np.zeros(np.shape(achieved_goal)[:-1], bool)[()]
-
-
-def _command(action: Any) -> list[float]:
-    """(v, ω) of an action; raises ``ValueError`` as :func:`rise_envs.actions.finite_action` does."""
-    if type(action) is np.ndarray and action.shape == (2,) and action.dtype.kind == "f":
-        values = action.tolist()
-        if math.isfinite(values[0]) and math.isfinite(values[1]):
-            return values
-    return finite_action(action, (2,)).tolist()
 
 
 class GroundVehicleEnv(VehicleTask, gym.Env):
@@ -228,7 +218,7 @@ class GroundVehicleEnv(VehicleTask, gym.Env):
             ValueError: an action of the wrong shape, or not finite. Nothing has moved then.
             gymnasium.error.ResetNeeded: before the first reset.
         """
-        now, (v, omega) = self._started(), _command(action)
+        now, (v, omega) = self._started(), finite_numbers(action, (2,))
         shown = np.empty(9 + 5 * self.n_obstacles)
         clearance, reward, reached = self._dynamics.step_alone(
             now, self._key, self._time, v, omega, self._numbers, shown

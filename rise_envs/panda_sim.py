@@ -114,6 +114,11 @@ class PandaSim:
         joints = self._bullet.getJointStates(self._arm, self._joints[:7], physicsClientId=self._client)
         return np.array((*self._position, *self._velocity, *[joint[0] for joint in joints]))
 
+    @property
+    def hand(self) -> tuple[float, ...]:
+        """Position of the hand (m), as in `state`, (3,)."""
+        return self._position
+
     def _read_hand(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         state = self._bullet.getLinkState(
             self._arm, HAND_LINK, computeLinkVelocity=True, physicsClientId=self._client

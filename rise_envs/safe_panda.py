@@ -10,7 +10,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rise_envs import goals
-from rise_envs.actions import checked_action
+from rise_envs.actions import finite_numbers
 from rise_envs.episodes import EpisodeStreams
 from rise_envs.panda_scene import DEFAULTS, Params
 from rise_envs.panda_task import PandaTask, make_spaces
@@ -130,6 +130,8 @@ class SafePandaEnv(PandaTask, gym.Env):
         goal, sphere, self._motion_key, *_ = self._starts.begin(key, self._constants)
         self._goal, self._sphere, self._time = goal[0], sphere, np.zeros(1, np.int64)
         self._least = self._nearest = sim.clearance(sphere[0, :3], float(sphere[0, 6]))
+        self._there: list[float] = self._goal.tolist()
+        self._away = goals.gap(sim.hand, self._there)  # m, from the goal
         self._trail = [self._state[:3]]
         return self._observe(sphere), self._info(self._state[:3], reached=False)
 
@@ -142,8 +144,8 @@ class SafePandaEnv(PandaTask, gym.Env):
             gymnasium.error.ResetNeeded: before the first reset.
         """
         sim, sphere = self._open_sim(), self._started()
-        commanded = checked_action(action, self.action_space).astype(np.float32)
-        before = self._state[:3]
+        wanted = [min(1.0, max(-1.0, x)) for x in finite_numbers(action, (3,))]
+        commanded, before, away = np.array(wanted, np.float32), self._state[:3], self._away
         x, y, z, u, v, w, radius = sphere[0].tolist()
         self._least, self._nearest = sim.step(commanded, (x, y, z), (u, v, w), radius, self._nearest)
         sphere = self._sphere = self._starts.advance(
@@ -151,11 +153,12 @@ class SafePandaEnv(PandaTask, gym.Env):
         )
         self._time = self._time + 1
         self._state = sim.state()
-        hand = self._state[:3]
-        self._trail.append(hand)
-        reached = bool(goals.distance(hand, self._goal) <= self.params.goal_radius)
+        if self.render_mode is not None:
+            self._trail.append(self._state[:3])
+        self._away = goals.gap(sim.hand, self._there)
+        reached = self._away <= self.params.goal_radius
         info = self._info(before, reached)
-        reward = float(self.compute_reward(hand, self._goal, info))
+        reward = goals.step_reward(away, self._away, reached, self.params.goal_radius, self.reward_type)
         terminated = reached or (self.terminate_on_collision and info["cost"] > 0)
         return self._observe(sphere), reward, terminated, False, info
 

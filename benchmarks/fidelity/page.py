@@ -176,7 +176,9 @@ def figure(paths: Mapping[str, Paths]) -> Figure:
     axes.yaxis.set_major_formatter("{x:g}")
     axes.set_xlabel("step", color=INK)
     axes.set_ylabel("distance of the hands (mm)", color=INK)
-    axes.set_title("The same actions in Bullet and in the model; dotted: nine in ten are nearer", fontsize=10, color=INK)
+    axes.set_title(
+        "The same actions in Bullet and in the model; dotted: nine in ten are nearer", fontsize=10, color=INK
+    )
     axes.grid(color=GRID)
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False, fontsize=8)
