@@ -29,7 +29,7 @@ smoke: $(STAMP)
 	$(BIN)/python -m benchmarks.run --agents rise pcbc cppo --preset smoke $(ARGS)
 
 speed: $(STAMP)
-	$(BIN)/python -m benchmarks.speed --docs docs/performance.md $(ARGS)
+	$(BIN)/python -m benchmarks.speed --docs docs/performance.md --bench-times $(ARGS)
 
 test: $(STAMP)
 	$(BIN)/python -m pytest -n auto $(ARGS)

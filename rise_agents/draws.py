@@ -19,14 +19,16 @@ class NormalDraws:
 
     def __call__(self, keys: NDArray[np.uint64], counter: NDArray[np.uint64]) -> NDArray[np.float32]:
         """The draws of steps ``counter`` (B,) of the streams ``keys`` (B,): (B, size)."""
-        if len(keys) > 1 or not counter[0]:
+        if len(keys) != 1 or not counter[0]:
             return self._draw(keys, counter)
         # An episode on its own: its next steps' draws together cost little more than one step's.
         block, place = divmod(int(counter[0]), _AHEAD)
         mark = int(keys[0]), block
-        if self._ahead[0] != mark:
-            self._ahead = mark, self._draw(keys, block * _AHEAD + np.arange(_AHEAD, dtype=np.uint64))
-        return self._ahead[1][place : place + 1]
+        ahead = self._ahead  # another thread may change it meanwhile
+        if ahead[0] != mark:
+            ahead = mark, self._draw(keys, block * _AHEAD + np.arange(_AHEAD, dtype=np.uint64))
+            self._ahead = ahead
+        return ahead[1][place : place + 1]
 
     def _draw(self, keys: NDArray[np.uint64], steps: NDArray[np.uint64]) -> NDArray[np.float32]:
         """Numbers step · size and following, (T, size), of the streams; keys are (T,), or (1,) for all steps."""

@@ -63,6 +63,8 @@ def _each(seed: Seeds, count: int) -> Sequence[Any]:
     """A seed, or None, for each sub-environment."""
     if isinstance(seed, int | np.integer):
         return range(int(seed), int(seed) + count)
+    if not isinstance(seed, Sequence | np.ndarray | None):
+        raise ValueError(f"a seed must be a whole number, or one for each sub-environment, got {seed!r}")
     seeds = [None] * count if seed is None else seed
     if len(seeds) != count:
         raise ValueError(f"expected {count} seeds, got {len(seeds)}")

@@ -180,6 +180,7 @@ class GroundVehicleEnv(VehicleTask, gym.Env):
 
         Raises:
             gymnasium.error.ResetNeeded: before the first reset.
+            ValueError: an assigned world that is not one episode with ``n_obstacles`` discs.
         """
         now = self._started()
         disc = now[5:].reshape(1, self.n_obstacles, 5).copy()
@@ -188,7 +189,13 @@ class GroundVehicleEnv(VehicleTask, gym.Env):
 
     @world.setter
     def world(self, world: World) -> None:
-        self._now = np.concatenate((world.state[0], world.goal[0], world.disc[0].ravel()))
+        given = tuple(np.shape(part) for part in (world.state, world.goal, world.disc))
+        if given != ((1, 3), (1, 2), (1, self.n_obstacles, 5)):
+            raise ValueError(
+                f"state, goal and disc must have shapes (1, 3), (1, 2), (1, {self.n_obstacles}, 5), got {given}"
+            )
+        parts = world.state[0], world.goal[0], world.disc[0].ravel()
+        self._now = np.concatenate(parts, dtype=np.float64)
         self._key, self._time = int(world.key[0]), int(world.step[0])
 
     def _started(self) -> Array:

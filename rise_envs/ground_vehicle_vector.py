@@ -28,7 +28,10 @@ class GroundVehicleVectorEnv(VehicleTask, VectorEnv):
 
     With ``backend="torch"`` observations, rewards, ends and infos are tensors on ``device``, and actions may be:
     ``gymnasium.make_vec("RISE-GroundVehicle-v0", num_envs=100_000, backend="torch", device="cuda")``. In one
-    thing infos differ then: ``final_obs`` of ``SAME_STEP`` is one batch of observations, not B dictionaries.
+    thing infos differ then: ``final_obs`` of ``SAME_STEP`` is one batch of observations, not B dictionaries. The
+    goal API (``compute_reward`` and the like) is for arrays of NumPy.
+
+    What a step of a large batch hands out is one piece of memory: copy what you keep of it.
 
     Args:
         num_envs: B, the number of episodes that run side by side.
@@ -99,12 +102,8 @@ class GroundVehicleVectorEnv(VehicleTask, VectorEnv):
         """
         mask = reset_mask(options, self.num_envs, first=self._world is None)
         self._streams.seed(seed, mask)
-        before, self._world = self._world, self._world or self._nowhere()
-        try:
-            shown = self._start(self._backend.own(np.flatnonzero(mask)))
-        except ValueError:
-            self._world = before
-            raise
+        self._world = self._world or self._nowhere()
+        shown = self._start(self._backend.own(np.flatnonzero(mask)))
         infos = self._infos(shown)
         return self._observation(shown), infos | self._masks(infos, mask)
 
@@ -133,7 +132,11 @@ class GroundVehicleVectorEnv(VehicleTask, VectorEnv):
             )
         base, number = self._streams.next(rows)
         backend = self._backend
-        backend.dynamics.restart(w, shown, rows, base, number, self.constants, backend.threads)
+        try:
+            backend.dynamics.restart(w, shown, rows, base, number, self.constants, backend.threads)
+        except ValueError:  # no room for a fair start: the world is half filled in, so it is none
+            self._world = None
+            raise
         self._done[rows] = False
         return shown
 

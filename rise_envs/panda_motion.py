@@ -176,7 +176,7 @@ def _step(
             w.target[2, m] = max(ZERO, w.target[2, m])
             for r in range(6):
                 w.sphere[r, m] = sphere[b, r]
-            w.least[m] = np.inf
+            w.least[m] = 1e9  # finite: fastmath knows no infinity
         _move(w)
         for m in range(min(LANES, count - first)):
             b = first + m

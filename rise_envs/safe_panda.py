@@ -119,15 +119,15 @@ class SafePandaEnv(PandaTask, gym.Env):
         """Start an episode; with ``seed`` the one that this seed names.
 
         Raises:
-            RuntimeError: the environment is closed.
+            RuntimeError: the environment is closed, or its parameters leave no room for a fair start.
         """
         super().reset(seed=seed)
         sim = self._open_sim()
-        sim.reset()
-        self._state, self.perceived = sim.state(), None
         self._streams.seed(seed, rng=self.np_random)
         key = episode_keys(*self._streams.next(np.array([0])))
         goal, sphere, self._motion_key, *_ = self._starts.begin(key, self._constants)
+        sim.reset()
+        self._state, self.perceived = sim.state(), None
         self._goal, self._sphere, self._time = goal[0], sphere, np.zeros(1, np.int64)
         self._least = self._nearest = sim.clearance(sphere[0, :3], float(sphere[0, 6]))
         self._there: list[float] = self._goal.tolist()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from typing import TypeVar
 
 T = TypeVar("T")
@@ -40,4 +40,8 @@ def run(work: Callable[[int, int], T], rows: int, threads: int, piece: int) -> l
 
     helpers = min(threads, -(-rows // piece)) - 1
     others = [_pool(threads).submit(share) for _ in range(helpers)]
-    return sum((other.result() for other in others), share())
+    try:
+        own = share()
+    finally:
+        wait(others)  # nobody writes any more when this returns, whatever happened
+    return sum((other.result() for other in others), own)

@@ -64,8 +64,12 @@ def _with_torch(dynamics: Any, device: str, compiled: bool) -> Backend:
 
     try:
         place = torch.device(device)
-        torch.zeros(1, device=place)
-    except (RuntimeError, AssertionError) as error:  # the latter from builds without CUDA
+        torch.zeros(1, device=place, dtype=torch.float64)
+    except (
+        RuntimeError,
+        AssertionError,
+        TypeError,
+    ) as error:  # of an unknown one, without CUDA, without float64
         reason = str(error).splitlines()[0]
         raise ValueError(f"torch cannot use device {device!r}: {reason}") from None
 

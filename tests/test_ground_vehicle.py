@@ -251,6 +251,14 @@ def test_a_graze_between_two_clear_instants_costs() -> None:
     assert info["cost"] == 1.0
 
 
+@pytest.mark.parametrize("discs", [0, 2])
+def test_a_scene_must_have_the_environments_number_of_discs(discs: int) -> None:
+    env, scene = make(), world([0, 0, 0], [1.6, 0, 0, 0, 1.0], [9, 9])
+    scene.disc = np.repeat(scene.disc, discs, axis=1)
+    with pytest.raises(ValueError, match="disc"):
+        env.world = scene
+
+
 @pytest.mark.parametrize("ends", [False, True])
 def test_collision_ends_the_episode_only_if_asked(ends: bool) -> None:
     env = make(terminate_on_collision=ends)

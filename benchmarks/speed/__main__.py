@@ -16,7 +16,7 @@ from rise_agents.cli import Parser, prepare_folder
 THROUGHPUT = "throughput"  # the figure, named among the rows
 _EXAMPLES = """\
 examples:
-  python -m benchmarks.speed                              every row and the figure, about four minutes
+  python -m benchmarks.speed                              every row and the figure, about five minutes
   python -m benchmarks.speed --rows vehicles panda        two rows
   python -m benchmarks.speed --bench-times                and the whole benchmark, cold and warm: ten minutes more
   python -m benchmarks.speed --docs docs/performance.md   measure, then renew the table and figure of the page
