@@ -81,3 +81,25 @@ def terminated(
         return ended
     cost = info["cost"] if isinstance(info, dict) else [entry["cost"] for entry in info]
     return ended | (np.asarray(cost) > 0)
+
+
+class GoalAPI:
+    """The goal API of an environment with ``reward_type``, ``terminate_on_collision`` and ``params``."""
+
+    reward_type: str
+    terminate_on_collision: bool
+    params: Any
+
+    def compute_reward(self, achieved_goal: NDArray, desired_goal: NDArray, info: Any) -> Any:
+        """Reward of one transition or of a batch: see :func:`reward`."""
+        return reward(achieved_goal, desired_goal, info, self.params.goal_radius, self.reward_type)
+
+    def compute_terminated(self, achieved_goal: NDArray, desired_goal: NDArray, info: Any) -> Any:
+        """Whether the goal is reached (or, with ``terminate_on_collision``, the step cost something)."""
+        return terminated(
+            achieved_goal, desired_goal, info, self.params.goal_radius, self.terminate_on_collision
+        )
+
+    def compute_truncated(self, achieved_goal: NDArray, desired_goal: NDArray, info: Any) -> Any:
+        """Never: the time limit truncates."""
+        return np.zeros(np.shape(achieved_goal)[:-1], bool)[()]

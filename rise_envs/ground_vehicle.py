@@ -45,7 +45,7 @@ def make_spaces(n_obstacles: int, p: Params) -> tuple[spaces.Dict, spaces.Box]:
     return observation, spaces.Box(np.array(low, np.float32), np.array(high, np.float32), dtype=np.float32)
 
 
-class VehicleTask:
+class VehicleTask(goals.GoalAPI):
     """What the single and the batched environment share: arguments, state, goal API, description."""
 
     def __init__(
@@ -72,20 +72,6 @@ class VehicleTask:
     def noise_scale(self) -> dict[str, Array]:
         """Standard deviation of the readings at noise level 1, per channel."""
         return {"obstacle": np.array(self.task(self.n_obstacles, self.params).noise_scale)}
-
-    def compute_reward(self, achieved_goal: Array, desired_goal: Array, info: Any) -> Any:
-        """Reward of one transition or of a batch: see :func:`rise_envs.goals.reward`."""
-        return goals.reward(achieved_goal, desired_goal, info, self.params.goal_radius, self.reward_type)
-
-    def compute_terminated(self, achieved_goal: Array, desired_goal: Array, info: Any) -> Any:
-        """Whether the goal is reached (or, with ``terminate_on_collision``, the step cost something)."""
-        return goals.terminated(
-            achieved_goal, desired_goal, info, self.params.goal_radius, self.terminate_on_collision
-        )
-
-    def compute_truncated(self, achieved_goal: Array, desired_goal: Array, info: Any) -> Any:
-        """Never: the time limit truncates."""
-        return np.zeros(np.shape(achieved_goal)[:-1], bool)[()]
 
 
 class GroundVehicleEnv(VehicleTask, gym.Env):

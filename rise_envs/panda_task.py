@@ -15,7 +15,7 @@ from rise_envs.task import Task
 Array = NDArray[np.float64]
 
 
-class PandaTask:
+class PandaTask(goals.GoalAPI):
     """Mixed into the environments: see :class:`rise_envs.safe_panda.SafePandaEnv` for all meanings."""
 
     def __init__(self, reward_type: str, terminate_on_collision: bool, params: Params) -> None:
@@ -47,20 +47,6 @@ class PandaTask:
     def noise_scale(self) -> dict[str, Array]:
         """Standard deviation of the reading at noise level 1, per channel."""
         return {"obstacle": np.array(self.task(self.params).noise_scale)}
-
-    def compute_reward(self, achieved_goal: Array, desired_goal: Array, info: Any) -> Any:
-        """Reward of one transition or of a batch: see :func:`rise_envs.goals.reward`."""
-        return goals.reward(achieved_goal, desired_goal, info, self.params.goal_radius, self.reward_type)
-
-    def compute_terminated(self, achieved_goal: Array, desired_goal: Array, info: Any) -> Any:
-        """Whether the goal is reached (or, with ``terminate_on_collision``, the step cost something)."""
-        return goals.terminated(
-            achieved_goal, desired_goal, info, self.params.goal_radius, self.terminate_on_collision
-        )
-
-    def compute_truncated(self, achieved_goal: Array, desired_goal: Array, info: Any) -> Any:
-        """Never: the time limit truncates."""
-        return np.zeros(np.shape(achieved_goal)[:-1], bool)[()]
 
 
 def _pose(state: Array) -> tuple[Array, Array]:
