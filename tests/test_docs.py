@@ -18,7 +18,7 @@ import pytest
 from benchmarks.protocol import PRESETS, make_plan
 from benchmarks.results import SCHEMA, SummaryRow
 from benchmarks.run import parser
-from benchmarks.speed.page import replace_block
+from benchmarks.speed.page import BLOCK
 from benchmarks.speed.rows import ROWS
 from rise_agents import AGENTS, agent_class, readings
 from rise_agents.agent import make_config
@@ -344,4 +344,4 @@ def test_every_row_of_the_speed_table_is_explained():
 
 def test_the_performance_page_can_be_renewed():
     text = (DOCS / "performance.md").read_text()
-    assert replace_block(text, "new") != text  # it has its one block
+    assert BLOCK.replaced(text, "new") != text  # it has its one block

@@ -56,17 +56,17 @@ def test_figures_and_their_targets() -> None:
 
 def test_the_page_is_renewed_between_its_markers(tmp_path: Path) -> None:
     file = tmp_path / "page.md"
-    file.write_text(f"before\n\n{page.BEGIN}\nold\n{page.END}\nafter\n")
+    file.write_text(f"before\n\n{page.BLOCK.begin}\nold\n{page.BLOCK.end}\nafter\n")
     content = page.markdown(rows(), "picture.png")
     for _ in range(2):
-        page.update_page(file, content)
+        page.BLOCK.update(file, content)
     text = file.read_text()
     assert text.startswith("before\n") and text.endswith("after\n") and "old" not in text
     assert "| random, away from the table | 9.0 |" in text
     assert "| expert-cbf, noise 1 | 75.0 / 50.0 | 50.0 / 50.0 | 75.0 |" in text
     file.write_text("no markers")
     with pytest.raises(ValueError, match="must hold"):
-        page.update_page(file, content)
+        page.BLOCK.update(file, content)
 
 
 def test_the_command_measures_and_writes(
@@ -77,7 +77,7 @@ def test_the_command_measures_and_writes(
 
     monkeypatch.setattr(measure, "trained", untrained)
     docs = tmp_path / "page.md"
-    docs.write_text(f"{page.BEGIN}\n{page.END}\n")
+    docs.write_text(f"{page.BLOCK.begin}\n{page.BLOCK.end}\n")
     (tmp_path / "images").mkdir()
     assert main(["--quick", "--out", str(tmp_path / "out"), "--docs", str(docs)]) == 0
     table = list(csv.DictReader((tmp_path / "out" / "fidelity.csv").read_text().splitlines()))

@@ -99,16 +99,19 @@ def test_quantities_have_three_digits():
 
 
 def test_block_of_a_page_is_replaced_and_nothing_else():
-    text = f"# Title\n\n{page.BEGIN}\nold\n{page.END}\n\nafter\n"
-    changed = page.replace_block(text, "new")
-    assert changed == f"# Title\n\n{page.BEGIN}\n\nnew\n{page.END}\n\nafter\n"
-    assert page.replace_block(changed, "new") == changed
+    text = f"# Title\n\n{page.BLOCK.begin}\nold\n{page.BLOCK.end}\n\nafter\n"
+    changed = page.BLOCK.replaced(text, "new")
+    assert changed == f"# Title\n\n{page.BLOCK.begin}\n\nnew\n\n{page.BLOCK.end}\n\nafter\n"
+    assert page.BLOCK.replaced(changed, "new") == changed
 
 
-@pytest.mark.parametrize("text", ["", page.BEGIN, page.END + page.BEGIN, (page.BEGIN + page.END) * 2])
+BEGIN, END = page.BLOCK.begin, page.BLOCK.end
+
+
+@pytest.mark.parametrize("text", ["", BEGIN, END + BEGIN, (BEGIN + END) * 2])
 def test_a_page_without_its_one_block_is_refused(text):
     with pytest.raises(ValueError, match="must hold the lines"):
-        page.replace_block(text, "new")
+        page.BLOCK.replaced(text, "new")
 
 
 def test_tensor_bytes_count_each_array_once():
@@ -174,7 +177,7 @@ def test_render_renews_a_page_from_the_last_measurement(tmp_path):
     throughput.write_points(out / "throughput.csv", [throughput.Point("vehicles", 10, 1e6, 9e5, 1.1e6)])
     (out / "machine.txt").write_text("A machine.\n")
     place = docs / "performance.md"
-    place.write_text(f"# Speed\n\n{page.BEGIN}\n{page.END}\n")
+    place.write_text(f"# Speed\n\n{page.BLOCK.begin}\n{page.BLOCK.end}\n")
     assert main(["--render", "--docs", str(place), "--out", str(out)]) == 0
     text = place.read_text()
     assert "A machine." in text and "(images/throughput.png)" in text

@@ -96,6 +96,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         arguments = parser().parse_args(argv)
         if arguments.episodes < 3:
             raise ValueError(f"--episodes must be at least 3, got {arguments.episodes}")
+        if arguments.docs:
+            from benchmarks.fidelity.page import BLOCK
+
+            BLOCK.check(arguments.docs)
         out: Path = arguments.out
         prepare_folder(out)
         warnings.simplefilter("ignore", DeprecationWarning)  # of libraries; their users cannot act on them
@@ -113,7 +117,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         atomic_write_text(out / "fidelity.md", text + "\n")
         if arguments.docs:
             plots.save_png(drawn, arguments.docs.parent / "images" / "fidelity.png")
-            page.update_page(arguments.docs, page.markdown(rows, "images/fidelity.png"))
+            page.BLOCK.update(arguments.docs, page.markdown(rows, "images/fidelity.png"))
     except ValueError as error:
         print(f"benchmarks.fidelity: {error}", file=sys.stderr)
         return 2

@@ -12,10 +12,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.fidelity.measure import Loops, Paths
+from benchmarks.pages import Block, markdown_table
 from benchmarks.plots import GRID, INK
 from benchmarks.results import atomic_write_text
 
-BEGIN, END = "<!-- fidelity: begin, made by `python -m benchmarks.fidelity` -->", "<!-- fidelity: end -->"
+BLOCK = Block("fidelity", "python -m benchmarks.fidelity")
 TITLES = {
     "random": "random, away from the table",
     "table": "random, on the table",
@@ -90,8 +91,7 @@ def write_csv(path: Path, rows: Sequence[Row]) -> None:
 
 
 def _table(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    rule = ["---", *["---:"] * (len(header) - 1)]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in (header, rule, *lines))
+    return markdown_table(header, ["---", *["---:"] * (len(header) - 1)], lines)
 
 
 def markdown(rows: Sequence[Row], picture: str) -> str:
@@ -144,20 +144,6 @@ def markdown(rows: Sequence[Row], picture: str) -> str:
     return "\n\n".join(
         (_table(head, paths), _table(loop_head, loops), f"![Distance of the hands]({picture})")
     )
-
-
-def update_page(path: Path, content: str) -> None:
-    """Replace what stands between the markers of a page.
-
-    Raises:
-        ValueError: the page or the markers, once each and in order, are not there.
-    """
-    page = path.read_text() if path.exists() else ""
-    before, begin, rest = page.partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not (begin and end) or BEGIN in rest or END in after:
-        raise ValueError(f"{path} must hold the lines {BEGIN!r} and {END!r} once, in this order")
-    atomic_write_text(path, f"{before}{BEGIN}\n\n{content}\n\n{END}{after}")
 
 
 def figure(paths: Mapping[str, Paths]) -> Figure:

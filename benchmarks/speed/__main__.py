@@ -52,9 +52,12 @@ def parser() -> Parser:
 
 
 def chosen(arguments: argparse.Namespace) -> list[str]:
-    """The names of the rows to measure; raises ``ValueError`` for an unknown one."""
+    """The names of the rows to measure; raises ``ValueError`` for an unknown one, or a page without block."""
+    from benchmarks.speed.page import BLOCK
     from benchmarks.speed.rows import ROWS
 
+    if arguments.docs:
+        BLOCK.check(arguments.docs)
     if arguments.repeats < 1:
         raise ValueError(f"--repeats must be at least 1, got {arguments.repeats}")
     known = [*ROWS, THROUGHPUT]
@@ -69,9 +72,10 @@ def chosen(arguments: argparse.Namespace) -> list[str]:
 
 def measure_all(names: Sequence[str], arguments: argparse.Namespace, out: Path) -> list[str]:
     """Measure and write ``speed.csv``, ``machine.txt`` and ``throughput.csv``; returns what went wrong."""
+    from benchmarks import pages
     from benchmarks.display import Display
     from benchmarks.results import atomic_write_text
-    from benchmarks.speed import measure, page, throughput
+    from benchmarks.speed import measure, throughput
     from benchmarks.speed.rows import ROWS
 
     quick = arguments.quick
@@ -94,11 +98,11 @@ def measure_all(names: Sequence[str], arguments: argparse.Namespace, out: Path) 
                 except measure.Unavailable as error:
                     results.append(measure.not_measured(row, str(error)))
                 except Exception as error:
-                    results.append(measure.not_measured(row, measure.reason(error)))
-                    wrong.append(f"{name}: {measure.reason(error)}")
+                    results.append(measure.not_measured(row, pages.reason(error)))
+                    wrong.append(f"{name}: {pages.reason(error)}")
     if results:
         measure.write_csv(out / "speed.csv", results)
-    atomic_write_text(out / "machine.txt", page.machine() + "\n")
+    atomic_write_text(out / "machine.txt", pages.machine() + "\n")
     return wrong
 
 

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import csv
-import io
 import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks.pages import csv_text
 from benchmarks.results import atomic_write_text
 
 Side = Callable[[], float]  # does its work once; the figure in the row's unit
@@ -176,12 +176,6 @@ def not_measured(row: Row, why: str) -> Result:
     return Result(row.name, None, row.unit, row.peer, target=target, note=f"not measured: {why}")
 
 
-def reason(error: Exception) -> str:
-    """One line that says what went wrong."""
-    lines = str(error).strip().splitlines()
-    return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
-
-
 def rate(work: Callable[[], int], seconds: float) -> float:
     """How many pieces per second ``work`` does, which says at each call how many it did."""
     pieces, started = 0, time.perf_counter()
@@ -199,12 +193,7 @@ def paced(ours: Callable[[], int], peer: Callable[[], int], effort: Effort) -> S
 
 def write_csv(path: Path, rows: Sequence[Result]) -> None:
     """Write results; floats with six digits."""
-    sink = io.StringIO()
-    table = csv.writer(sink, lineterminator="\n")
-    table.writerow([field.name for field in fields(Result)])
-    for row in rows:
-        table.writerow([f"{cell:.6g}" if isinstance(cell, float) else cell for cell in astuple(row)])
-    atomic_write_text(path, sink.getvalue())
+    atomic_write_text(path, csv_text(Result, rows))
 
 
 def read_csv(path: Path) -> list[Result]:

@@ -3,48 +3,19 @@
 from __future__ import annotations
 
 import io
-import platform
 from collections.abc import Sequence
-from importlib import metadata
 from pathlib import Path
 
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.results import atomic_write_text
+from benchmarks.pages import Block, markdown_table
 from benchmarks.speed.measure import Result
 from benchmarks.speed.rows import ROWS
-from rise_agents.workers import available_cores
 
-BEGIN, END = "<!-- speed: begin, made by `make speed` -->", "<!-- speed: end -->"
+BLOCK = Block("speed", "make speed")
 _COLUMNS = ("", "Ours", "Peer", "", "Ratio [quartiles]", "Target", "Met")
-_LIBRARIES = ("numpy", "gymnasium", "torch", "stable-baselines3", "panda-gym", "pybullet", "numba")
-
-
-def machine() -> str:
-    """What was measured on, in a sentence."""
-    versions = ", ".join(f"{name} {metadata.version(name)}" for name in _LIBRARIES)
-    cores = available_cores()
-    return (
-        f"{_processor()}, {cores} core{'s' if cores > 1 else ''}{_gpu()}; {platform.system()}, "
-        f"Python {platform.python_version()}, {versions}."
-    )
-
-
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        lines = []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
-
-
-def _gpu() -> str:
-    import torch
-
-    return f", {torch.cuda.get_device_name()}" if torch.cuda.is_available() else ""
 
 
 def quantity(value: float | None, unit: str) -> str:
@@ -82,12 +53,8 @@ def table_text(results: Sequence[Result], width: int = 140) -> str:
 
 def markdown(results: Sequence[Result], about: str, picture: str | None) -> str:
     """The machine, the table with its notes, and the picture."""
-    lines = [
-        _COLUMNS,
-        ("---", "---:", "---:", "---", "---:", "---:", "---"),
-        *(cells(result) for result in results),
-    ]
-    blocks = [about, "\n".join(f"| {' | '.join(row)} |" for row in lines)]
+    rules = ("---", "---:", "---:", "---", "---:", "---:", "---")
+    blocks = [about, markdown_table(_COLUMNS, rules, [cells(result) for result in results])]
     notes = [f"- {cells(result)[0]}: {result.note}." for result in results if result.note]
     if notes:
         blocks.append("\n".join(notes))
@@ -96,28 +63,11 @@ def markdown(results: Sequence[Result], about: str, picture: str | None) -> str:
     return "\n\n".join(blocks) + "\n"
 
 
-def replace_block(page: str, content: str) -> str:
-    """``page`` with what stands between the two markers replaced.
-
-    Raises:
-        ValueError: the markers are not there, once each and in order.
-    """
-    before, begin, rest = page.partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not (begin and end) or BEGIN in rest or END in after:
-        raise ValueError(f"the page must hold the lines {BEGIN!r} and {END!r} once, in this order")
-    return f"{before}{BEGIN}\n\n{content}\n{END}{after}"
-
-
 def update_page(path: Path, results: Sequence[Result], about: str, picture: Path | None) -> None:
-    """Replace the block of a page in ``docs/``; the picture, if any, lies beside or below it.
+    """Renew the block of a page in ``docs/``; the picture, if any, lies beside or below it.
 
     Raises:
         ValueError: no such page, or no such block in it.
     """
-    try:
-        page = path.read_text()
-    except OSError as error:
-        raise ValueError(f"cannot read the page {path}: {error.strerror}") from None
     link = picture.relative_to(path.parent).as_posix() if picture else None
-    atomic_write_text(path, replace_block(page, markdown(results, about, link)))
+    BLOCK.update(path, markdown(results, about, link))

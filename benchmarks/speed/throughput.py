@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import csv
-import io
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +15,11 @@ from gymnasium.vector import VectorEnv
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
+from benchmarks.pages import csv_text, reason
 from benchmarks.plots import FAINT, GRID, INK
 from benchmarks.results import atomic_write_text
 from benchmarks.speed import envs
-from benchmarks.speed.measure import Effort, rate, reason
+from benchmarks.speed.measure import Effort, rate
 
 SIZES = (1, 10, 100, 1_000, 10_000, 100_000)
 
@@ -123,12 +123,7 @@ def _opened(size: int, failed: dict[str, str]) -> Iterator[dict[str, envs.Work]]
 
 def write_points(path: Path, points: Sequence[Point]) -> None:
     """Write ``throughput.csv``."""
-    sink = io.StringIO()
-    table = csv.writer(sink, lineterminator="\n")
-    table.writerow([field.name for field in fields(Point)])
-    for point in points:
-        table.writerow([f"{cell:.6g}" if isinstance(cell, float) else cell for cell in astuple(point)])
-    atomic_write_text(path, sink.getvalue())
+    atomic_write_text(path, csv_text(Point, points))
 
 
 def read_points(path: Path) -> list[Point]:
