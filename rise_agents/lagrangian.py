@@ -239,7 +239,7 @@ class ConstrainedPPO(PPO):
 
     def restore(self, arrays: dict[str, NDArray], notes: dict[str, Any]) -> None:
         """Go on from what :meth:`snapshot` gave, by ``learn(..., reset_num_timesteps=False)``."""
-        states: dict[str, dict] = {}
+        states: dict[str, Any] = {}
         for name, part in self._parts().items():
             is_module = isinstance(part, torch.nn.Module)
             states[_PARTS[name]] = under(arrays, name) if is_module else optimiser_state(part, arrays, name)
