@@ -69,14 +69,16 @@ class Display:
         if seen:
             self._end(name, f"{name}: done in {time.monotonic() - started:.0f} s")
         else:
-            self._line(f"{name}: there already")
+            self.say(f"{name}: there already")
 
     def plan(self, jobs: Sequence[Job]) -> None:
         """Say how many jobs there will be."""
         self._jobs = len(jobs)
         there = sum(job.output.exists() for job in jobs)
         self._left = Counter(job.name for job in jobs)
-        self._line(f"{len(jobs)} jobs: train, evaluate, draw" + (f"; {there} done already" if there else ""))
+        self.say(
+            f"{len(jobs)} jobs: record, train, evaluate, draw" + (f"; {there} done already" if there else "")
+        )
         if self.live:
             self._total = self.bars.add_task("[bold]all jobs", total=len(jobs), figures="")
 
@@ -109,15 +111,16 @@ class Display:
             last = self._told.setdefault(name, now)
             if now - last >= _PLAIN_EVERY:
                 self._told[name] = now
-                self._line(f"{name}: {100 * share:.0f} %  {words}")
+                self.say(f"{name}: {100 * share:.0f} %  {words}")
 
     def _end(self, name: str, line: str) -> None:
         with self._lock:
             if name in self._tasks:
                 self.bars.remove_task(self._tasks.pop(name))
         if line:
-            self._line(line)
+            self.say(line)
 
-    def _line(self, text: str) -> None:
+    def say(self, text: str) -> None:
+        """Tell something, with the time since the start."""
         seconds = time.monotonic() - self._started
         self.console.print(f"{seconds:6.0f} s  {text}", highlight=False, markup=False, soft_wrap=True)

@@ -8,7 +8,7 @@ results.
 from __future__ import annotations
 
 import json
-import time
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,8 +19,12 @@ from benchmarks.policies import make_policy
 from benchmarks.protocol import Plan, Scenarios, digest, imitates
 from benchmarks.videos import record
 from rise_agents import AGENTS, __version__, agent_class, demonstrations, make_agent
-from rise_agents.agent import Progress, config_to_dict, make_config, silent
+from rise_agents.agent import Progress, config_to_dict, make_config
+from rise_agents.demonstrations import recording
+from rise_agents.resume import Resume
 from rise_agents.rollout import rollout
+
+PARTS = "parts"  # folder for the pieces of demonstrations that are being recorded
 
 
 @dataclass(frozen=True)
@@ -65,8 +69,28 @@ def complete_settings(plan: Plan, env: str, agent: str) -> dict[str, Any]:
     return config_to_dict(make_config(agent_class(agent), env, plan.config(agent, env)))
 
 
-def training_jobs(plan: Plan, out: Path, device: str) -> list[Job]:
-    """One job for each agent, environment and training seed."""
+def recording_jobs(plan: Plan, out: Path) -> list[Job]:
+    """For each environment in which somebody imitates: a job per piece of demonstrations, one to put them together."""
+    jobs = []
+    for env in plan.envs:
+        if not any(agent in AGENTS and imitates(agent) for agent in plan.agents):
+            continue
+        folder = demonstrations_folder(plan, env, out)
+        output, parts = folder / demonstrations.DATA, folder / PARTS
+        recorded = {"env": env, "expert": plan.expert, "episodes": plan.demos}
+        count, pieces = recording.chunk_size(plan.demos), []
+        if not output.exists():  # else they are not needed, and gone
+            for start in range(0, plan.demos, count):
+                arguments = {"env_id": env, "expert": plan.expert, "seed": 0, "start": start, "count": count}
+                path = recording.part_path(parts, start)
+                pieces.append(Job(f"record {plan.expert} on {env}", recording.record_part, arguments, path))
+        needs = tuple(piece.output for piece in pieces)
+        jobs += [*pieces, Job(f"collect demonstrations of {env}", collect, recorded, output, needs)]
+    return jobs
+
+
+def training_jobs(plan: Plan, out: Path, device: str, every: float) -> list[Job]:
+    """One job for each agent, environment and training seed; ``every`` so many seconds they store their state."""
     jobs = []
     for env in plan.envs:
         for agent, seed in plan.rows(env):
@@ -80,10 +104,11 @@ def training_jobs(plan: Plan, out: Path, device: str) -> list[Job]:
                 "seed": seed,
                 "config": plan.config(agent, env),
             }
-            arguments |= {"data": folder if clones else None, "device": device}
+            arguments |= {"data": folder if clones else None, "device": device, "every": every}
             output = checkpoint_path(plan, env, agent, seed, out)
             name = f"train {agent} on {env}" + (f", seed {seed}" if plan.seeds > 1 else "")
-            jobs.append(Job(name, train, arguments, output, (), weight=10.0 if clones else 100.0))
+            needs = (folder / demonstrations.DATA,) if clones else ()
+            jobs.append(Job(name, train, arguments, output, needs, weight=10.0 if clones else 100.0))
     return jobs
 
 
@@ -140,17 +165,15 @@ def check_settings(plan: Plan) -> None:
                     raise ValueError(f"settings of {agent}: {error}") from None
 
 
-def generate_demonstrations(
-    plan: Plan, env: str, folder: Path, workers: int, progress: Progress = silent
-) -> None:
-    """Record the demonstrations of an environment, unless they are there already."""
-    if (folder / demonstrations.CARD).exists():
-        return
+def collect(output: Path, progress: Progress, env: str, expert: str, episodes: int) -> None:
+    """Put the recorded pieces together (recording more where too many episodes were rejected); removes them."""
+    parts = output.parent / PARTS
 
     def tell(kept: int, tried: int) -> None:
-        progress(kept / plan.demos, {"kept": kept, "tried": tried})
+        progress(kept / episodes, {"kept": kept, "tried": tried})
 
-    demonstrations.generate(env, plan.expert, plan.demos, workers=workers, finished=tell).save(folder)
+    demonstrations.generate(env, expert, episodes, finished=tell, parts=parts).save(output.parent)
+    shutil.rmtree(parts)
 
 
 def train(
@@ -162,19 +185,16 @@ def train(
     config: dict[str, Any],
     data: Path | None,
     device: str,
+    every: float,
 ) -> None:
-    """Train one agent; writes its checkpoint and, beside it, a JSON record of the training."""
-    started, curve = time.perf_counter(), []
-
-    def tell(share: float, figures: dict[str, float]) -> None:
-        curve.append({"share": share, **figures})
-        progress(share, figures)
-
+    """Train one agent, from where it was interrupted; writes its checkpoint and a JSON record of the training."""
+    resume = Resume(output.with_suffix(".training"), every)
     learner = make_agent(agent, env, config, seed, device)
-    learner.learn(env if data is None else demonstrations.load(data), tell)
-    record = {"seconds": round(time.perf_counter() - started, 1), "device": device, "curve": curve}
+    learner.learn(env if data is None else demonstrations.load(data), progress, resume)
+    record = {"seconds": round(resume.seconds, 1), "device": device, "curve": resume.curve}
     results.atomic_write_text(output.with_suffix(".json"), json.dumps(record) + "\n")
     learner.save(output)
+    Path(output.with_suffix(".training")).unlink(missing_ok=True)
 
 
 def evaluate(

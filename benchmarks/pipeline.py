@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import platform
 import shlex
-from dataclasses import asdict
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,47 +19,54 @@ from benchmarks.jobs import (
     complete_settings,
     demonstrations_folder,
     evaluation_jobs,
-    generate_demonstrations,
+    recording_jobs,
     training_jobs,
     video_jobs,
 )
-from benchmarks.labels import env_label
 from benchmarks.protocol import Plan, imitates
 from rise_agents import AGENTS, checkpoint, demonstrations
+from rise_agents.files import sweep
 
 
-def execute(
-    plan: Plan, out: Path, workers: int, device: str, videos: bool, command: list[str]
-) -> list[Failure]:
-    """Do all that the plan asks for and is not done yet.
+@dataclass(frozen=True)
+class How:
+    """How a plan is carried out; none of this changes a result, but for the last digits that a device gives.
 
-    Args:
-        plan: what to measure.
-        out: the run folder.
+    Attributes:
         workers: processes.
         device: torch device for training.
         videos: whether to draw clips.
+        every: seconds between two checkpoints of a training.
         command: how this run was started, for ``run.json``.
+    """
+
+    workers: int
+    device: str = "cpu"
+    videos: bool = True
+    every: float = 15.0
+    command: tuple[str, ...] = ()
+
+
+def execute(plan: Plan, out: Path, how: How) -> list[Failure]:
+    """Do all that the plan asks for and is not done yet, in the run folder ``out``.
 
     Returns:
         What failed; tables and figures then show what there is.
     """
+    for folder in [out, *(path for path in out.rglob("*") if path.is_dir())]:
+        sweep(folder)
     with Display() as display:
-        for env in plan.envs:
-            if any(agent in AGENTS and imitates(agent) for agent in plan.agents):
-                folder = demonstrations_folder(plan, env, out)
-                with display.step(f"demonstrations of {env_label(env)}") as progress:
-                    generate_demonstrations(plan, env, folder, workers, progress)
-        trainings, evaluations = training_jobs(plan, out, device), evaluation_jobs(plan, out)
-        clips = video_jobs(plan, out) if videos else []
-        display.plan([*trainings, *evaluations, *clips])
-        failures = run_jobs([*trainings, *evaluations, *clips], workers, display.watch)
-    _write_run(plan, out, device, command)
-    _write_results(plan, out, evaluations, command)
+        evaluations = evaluation_jobs(plan, out)
+        jobs = [*recording_jobs(plan, out), *training_jobs(plan, out, how.device, how.every), *evaluations]
+        jobs += video_jobs(plan, out) if how.videos else []
+        display.plan(jobs)
+        failures = run_jobs(jobs, how.workers, display.watch, display.say)
+    _write_run(plan, out, how, failures)
+    _write_results(plan, out, evaluations, how.command)
     return failures
 
 
-def _write_results(plan: Plan, out: Path, evaluations: list[Job], command: list[str]) -> None:
+def _write_results(plan: Plan, out: Path, evaluations: list[Job], command: Sequence[str]) -> None:
     """Everything that is computed from the rows of episodes."""
     parts = [job.output for job in evaluations if job.output.exists()]
     if not parts:
@@ -92,15 +100,15 @@ def _trained(plan: Plan, out: Path) -> dict[str, dict[str, Any]]:
     return facts
 
 
-def _write_run(plan: Plan, out: Path, device: str, command: list[str]) -> None:
+def _write_run(plan: Plan, out: Path, how: How, failures: list[Failure]) -> None:
     """``run.json``: all that is needed to repeat the run."""
     cards = {}
     for env in plan.envs:
-        card = demonstrations_folder(plan, env, out) / demonstrations.CARD
-        if card.exists():
-            cards[env] = json.loads(card.read_text())
+        folder = demonstrations_folder(plan, env, out)
+        if (folder / demonstrations.DATA).exists():
+            cards[env] = json.loads((folder / demonstrations.CARD).read_text())
     run = {
-        "command": shlex.join(command),
+        "command": shlex.join(how.command),
         "plan": asdict(plan),
         "settings": {
             f"{agent}@{env}": complete_settings(plan, env, agent)
@@ -108,7 +116,8 @@ def _write_run(plan: Plan, out: Path, device: str, command: list[str]) -> None:
             for agent in plan.agents
             if agent in AGENTS
         },
-        "device": device,
+        "device": how.device,
+        "failed": {failure.job.name: failure.reason for failure in failures},
         "demonstrations": cards,
         "agents": {
             env: {

@@ -22,7 +22,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from benchmarks import stats
-from rise_agents.checkpoint import replace_file
+from rise_agents.files import replace_file
 
 StrPath = str | os.PathLike[str]
 

@@ -87,6 +87,13 @@ def parser() -> Parser:
         help="processes (default: one per core); results do not depend on it",
     )
     p.add_argument("--device", default="cpu", help="torch device that agents train on (default: cpu)")
+    p.add_argument(
+        "--checkpoint-every",
+        type=float,
+        default=15.0,
+        metavar="S",
+        help="seconds between two checkpoints of a training, from which it goes on if interrupted (default: 15)",
+    )
     p.add_argument("--no-videos", action="store_true", help="skip the clips")
     p.add_argument("--out", type=Path, metavar="DIR", help="run folder (default: runs/PRESET)")
     return p  # fmt: skip
@@ -133,6 +140,8 @@ def plan_of(arguments: argparse.Namespace) -> Plan:
     check_settings(plan)
     if arguments.workers is not None and arguments.workers < 1:
         raise ValueError(f"--workers must be at least 1, got {arguments.workers}")
+    if not arguments.checkpoint_every >= 0:
+        raise ValueError(f"--checkpoint-every must not be negative, got {arguments.checkpoint_every}")
     _check_device(arguments.device)
     return plan
 
@@ -163,13 +172,21 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
     except KeyboardInterrupt:
         return 130
-    from benchmarks.pipeline import execute
+    from benchmarks.pipeline import How, execute
+    from rise_agents.files import sole_user
     from rise_agents.workers import available_cores
 
-    workers = arguments.workers or available_cores()
-    command = ["python", "-m", "benchmarks.run", *(sys.argv[1:] if argv is None else argv)]
+    command = ("python", "-m", "benchmarks.run", *(sys.argv[1:] if argv is None else argv))
+    how = How(
+        workers=arguments.workers or available_cores(),
+        device=arguments.device,
+        videos=not arguments.no_videos,
+        every=arguments.checkpoint_every,
+        command=command,
+    )
     try:
-        failures = execute(plan, out, workers, arguments.device, not arguments.no_videos, command)
+        with sole_user(out):
+            failures = execute(plan, out, how)
     except KeyboardInterrupt:
         print(
             "\nbenchmarks.run: interrupted; what is finished is kept, run the command again to go on",

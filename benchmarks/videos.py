@@ -15,6 +15,7 @@ from PIL import Image, ImageDraw, ImageFont
 from benchmarks.labels import agent_label, env_label
 from benchmarks.policies import make_policy
 from rise_agents.agent import Progress, initial_state
+from rise_agents.files import replace_file, replacing
 from rise_agents.rollout import policy_keys
 from rise_envs.noise_wrappers import ObservationNoise
 
@@ -115,16 +116,15 @@ def record(
             words = clip.outcome if ended else f"scenario {n} · {clip.times[i]:.2f} s"
             captioned = caption(frame, title, words, _COLOURS[clip.outcome] if ended else "#57606a")
             frames += [captioned] * (HOLD if ended else 1)
-    output.parent.mkdir(parents=True, exist_ok=True)
-    partial = output.with_name(f".{output.name}")
-    iio.imwrite(
-        partial,
-        np.stack(frames),
-        extension=".mp4",
-        fps=FRAMES_PER_SECOND,
-        codec="libx264",
-        macro_block_size=16,
-        output_params=["-preset", "veryfast"],  # half the time of the usual one, files a tenth larger
-    )
-    iio.imwrite(output.with_name(f"{output.stem}-frames.png"), strip(clips[0]))
-    partial.replace(output)
+    strip_png = iio.imwrite("<bytes>", strip(clips[0]), extension=".png")
+    replace_file(output.with_name(f"{output.stem}-frames.png"), strip_png)
+    with replacing(output) as partial:
+        iio.imwrite(
+            partial,
+            np.stack(frames),
+            extension=".mp4",
+            fps=FRAMES_PER_SECOND,
+            codec="libx264",
+            macro_block_size=16,
+            output_params=["-preset", "veryfast"],  # half the time of the usual one, files a tenth larger
+        )

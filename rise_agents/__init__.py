@@ -61,8 +61,8 @@ def load_agent(path: str | os.PathLike[str], env_id: str | None = None, device: 
     from rise_agents import checkpoint
 
     arrays, description = checkpoint.load(path)
-    name, env = description.get("agent"), description.get("env")
-    if name not in AGENTS:
+    name, env = description.get("agent"), description["env"]
+    if not isinstance(name, str) or name not in AGENTS:
         raise checkpoint.CheckpointError(path, f"holds an unknown agent {name!r}", "update the package")
     if env_id is not None and env != env_id:
         raise checkpoint.CheckpointError(
@@ -70,7 +70,6 @@ def load_agent(path: str | os.PathLike[str], env_id: str | None = None, device: 
         )
     try:
         return agent_class(name).from_checkpoint(arrays, description, device)
-    except (KeyError, TypeError, ValueError) as error:
-        raise checkpoint.CheckpointError(
-            path, f"lacks a part of the agent ({error})", "train it again"
-        ) from None
+    except Exception as error:  # a right digest says who wrote a file, not that it makes sense
+        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        raise checkpoint.CheckpointError(path, f"is no whole agent ({reason})", "train it again") from None

@@ -57,8 +57,19 @@ class Agent(Policy, Protocol):
     learns_from: str
     evaluate_deterministic: bool
 
-    def learn(self, source: Any, progress: Progress = silent) -> Agent:
-        """Train on demonstrations, or in the environment whose id is given."""
+    def learn(self, source: Any, progress: Progress = silent, resume: Any = None) -> Agent:
+        """Train on demonstrations, or in the environment whose id is given.
+
+        Args:
+            source: what it learns from.
+            progress: told now and then.
+            resume: a :class:`rise_agents.resume.Resume`, or a path for one: where the state of the training is kept,
+                and from where an interrupted one goes on, to the same weights bit for bit (on the CPU).
+
+        Raises:
+            ValueError: a source that it cannot learn from.
+            rise_agents.checkpoint.CheckpointError: the file to go on from is damaged or of another training.
+        """
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Store everything that :func:`rise_agents.load_agent` needs."""

@@ -1,28 +1,31 @@
-"""The only place that writes or reads a trained agent.
+"""The only place that writes or reads a trained agent, or one that is still being trained.
 
-One file: 8 bytes of magic, the SHA-256 of all that follows, then a safetensors archive whose header carries
-the JSON description (schema, agent, environment, config, versions). The digest is verified before anything is
-parsed, and safetensors holds numbers only: reading a file can neither execute code nor accept a flipped bit.
+The file is an archive of :mod:`rise_agents.archive` whose description names the agent, the environment with a
+digest of its spaces, the config, the seed and the library versions. Whatever is wrong with it ends in a
+:class:`CheckpointError`.
 """
 
 from __future__ import annotations
 
 import hashlib
-import json
 import os
-import secrets
 from collections.abc import Mapping
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
-import safetensors.numpy as st
+from gymnasium import spaces
 from numpy.typing import NDArray
 
-MAGIC = b"RISEckpt"
-SCHEMA = 1
-_PACKAGES = ("gymnasium", "numpy", "torch", "stable-baselines3", "panda-gym")
+from rise_agents import archive
+from rise_agents.files import StrPath
+
+KIND = "agent"
+_PACKAGES = ("rise-suite", "gymnasium", "numpy", "torch", "stable-baselines3", "panda-gym")
+_AGAIN = "give a whole file that agent.save() wrote, or train the agent again"
 
 
 class CheckpointError(Exception):
@@ -33,59 +36,84 @@ class CheckpointError(Exception):
         self.path, self.reason, self.remedy = Path(path), reason, remedy
 
 
-def replace_file(path: str | os.PathLike[str], content: bytes) -> None:
-    """Write ``content`` to ``path`` so that a reader finds the old file or the new one, never a part."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    # Not tempfile: its files are private to the user, and results are there to be shared.
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}.tmp")
-    try:
-        with temporary.open("xb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
-
-
 def versions() -> dict[str, str]:
     """Versions of the libraries that results depend on."""
     return {name: metadata.version(name) for name in _PACKAGES}
 
 
-def save(path: str | os.PathLike[str], arrays: Mapping[str, NDArray], description: Mapping[str, Any]) -> None:
-    """Store named ``arrays`` and a JSON-able ``description`` (at least ``agent``, ``env``, ``config``)."""
-    header = {"schema": SCHEMA, "versions": versions(), **description}
-    contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-    body = st.save(contiguous, metadata={"rise": json.dumps(header, sort_keys=True)})
-    replace_file(path, MAGIC + hashlib.sha256(body).digest() + body)
+@cache
+def spaces_digest(env_id: str) -> str:
+    """A digest of the observation and action space of a registered environment: names, shapes, bounds, types."""
+    env = gym.make(env_id)
+    described = repr([_described(env.observation_space), _described(env.action_space)])
+    env.close()
+    return hashlib.sha256(described.encode()).hexdigest()[:16]
 
 
-def load(path: str | os.PathLike[str]) -> tuple[dict[str, NDArray], dict[str, Any]]:
+def _described(space: spaces.Space) -> Any:
+    if isinstance(space, spaces.Dict):
+        return [(key, _described(part)) for key, part in sorted(space.spaces.items())]
+    if isinstance(space, spaces.Box):
+        return "Box", space.shape, str(space.dtype), space.low.tobytes().hex(), space.high.tobytes().hex()
+    return repr(space)
+
+
+def save(
+    path: StrPath, arrays: Mapping[str, NDArray], description: Mapping[str, Any], kind: str = KIND
+) -> None:
+    """Store named ``arrays`` and a JSON-able ``description`` (at least ``agent``, ``env``, ``config``).
+
+    Raises:
+        ValueError: a number that is not finite.
+        OSError: the file cannot be written; an earlier one is intact.
+    """
+    for name, array in arrays.items():
+        if not np.isfinite(array).all():
+            raise ValueError(f"{name} holds a number that is not finite: the training has diverged")
+    spaces = spaces_digest(description["env"])
+    archive.write(path, kind, arrays, {"versions": versions(), "spaces": spaces, **description})
+
+
+def load(path: StrPath, kind: str = KIND) -> tuple[dict[str, NDArray], dict[str, Any]]:
     """The arrays and the description that :func:`save` stored.
 
     Raises:
-        CheckpointError: missing, damaged, foreign, or of another schema.
+        CheckpointError: missing, damaged, foreign, of another schema, or of an environment that is not
+            registered here or has other spaces here.
     """
-    again = "train the agent again or copy the file once more"
     try:
-        content = Path(path).read_bytes()
-    except OSError as error:
-        raise CheckpointError(path, f"cannot be read ({error.strerror})", "check the path") from None
-    body = content[len(MAGIC) + 32 :]
-    if not content.startswith(MAGIC):
-        raise CheckpointError(path, "is no RISE checkpoint", "give a file written by agent.save()")
-    if hashlib.sha256(body).digest() != content[len(MAGIC) : len(MAGIC) + 32]:
-        raise CheckpointError(path, "is damaged (its SHA-256 does not match)", again)
-    try:
-        arrays = st.load(body)
-        size = int.from_bytes(body[:8], "little")
-        description = json.loads(json.loads(body[8 : 8 + size])["__metadata__"]["rise"])
-        schema = description["schema"]
-    except Exception as error:  # a digest that fits does not make a foreign archive one of ours
-        raise CheckpointError(path, f"holds no RISE agent ({error})", again) from None
-    if schema != SCHEMA:
-        raise CheckpointError(path, f"has schema {schema}, this version reads {SCHEMA}", again)
+        arrays, description = archive.read(path, kind)
+    except archive.ArchiveError as error:
+        raise CheckpointError(path, error.reason, _AGAIN) from None
+    _check_env(path, description)
+    for name, array in arrays.items():
+        if not np.isfinite(array).all():
+            raise CheckpointError(path, f"{name} holds a number that is not finite", _AGAIN)
     return arrays, description
+
+
+def _check_env(path: StrPath, description: dict[str, Any]) -> None:
+    import rise_envs  # noqa: F401  registers the environments
+
+    env = description.get("env")
+    # Looked up, not handed to Gymnasium, which would import the module that an id "module:name" names.
+    if not isinstance(env, str) or env not in gym.registry:
+        remedy = "import the package that registers it first"
+        raise CheckpointError(path, f"was trained on {env!r}, which is not registered", remedy)
+    stored, here = description.get("spaces"), spaces_digest(env)
+    if stored != here:
+        reason = f"was trained on {env} with spaces {stored}, here they are {here}"
+        raise CheckpointError(path, reason, "train it again")
+
+
+def expect(arrays: Mapping[str, NDArray], shapes: Mapping[str, tuple[int, ...]]) -> None:
+    """Raise ``ValueError`` unless ``arrays`` are floats of exactly the names and shapes of ``shapes``."""
+    for name, shape in shapes.items():
+        if name not in arrays:
+            raise ValueError(f"array {name!r} is missing")
+        if arrays[name].shape != tuple(shape) or arrays[name].dtype.kind != "f":
+            found = f"{arrays[name].dtype}{arrays[name].shape}"
+            raise ValueError(f"array {name!r} is {found}, not float{tuple(shape)}")
+    for name in arrays:
+        if name not in shapes:
+            raise ValueError(f"array {name!r} belongs to no part of the agent")

@@ -6,6 +6,7 @@ Shapes: B batch, M samples, T transitions, R robot inputs, C reading inputs, A a
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -13,12 +14,15 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from rise_agents import checkpoint, readings
-from rise_agents.agent import config_to_dict, require, require_widths
+from rise_agents.agent import Progress, config_to_dict, require, require_widths
 from rise_agents.demonstrations import Demonstrations
+from rise_agents.files import StrPath
 from rise_agents.readings import Standardiser
+from rise_agents.resume import Resume
+from rise_agents.stages import Stages
 from rise_agents.training import Layer, rescaled
 from rise_agents.workers import keep_freed_memory
 from rise_envs.task import Task, env_class, task_of
@@ -93,6 +97,11 @@ class ActionUnits:
         low, high = self._bounds
         return np.minimum(np.maximum(action, low), high)
 
+    @property
+    def size(self) -> int:
+        """A, the number of actions."""
+        return len(self.low)
+
     @cached_property
     def _bounds(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         return self.low.astype(np.float32), self.high.astype(np.float32)
@@ -142,21 +151,39 @@ class Eyes:
         return cls(task, frame, robot, reading)
 
 
-def begin(agent: Any, source: Any) -> tuple[Demonstrations, Eyes, CloningData, torch.Generator]:
+@dataclass(frozen=True)
+class Lesson:
     """What every cloned agent begins to learn with.
 
-    Returns:
-        Checked demonstrations, how they are seen, the same as tensors on the training device (all at once),
-        and the generator of all that is random; see :func:`seeded`.
+    Attributes:
+        demonstrations: checked, and cut as the config says.
+        eyes: how they are seen.
+        data: the same as tensors on the training device, all at once.
+        generator: of all that is random; see :func:`seeded`.
+        stages: the fits that this training consists of, some of which an earlier process may have done.
+        progress: to tell of the training.
     """
+
+    demonstrations: Demonstrations
+    eyes: Eyes
+    data: CloningData
+    generator: torch.Generator
+    stages: Stages
+    progress: Progress
+
+
+def begin(agent: Any, source: Any, progress: Progress, resume: Resume | StrPath | None) -> Lesson:
+    """The arguments of ``agent.learn``, checked and prepared."""
     c = agent.config
     demonstrations = check_source(source, agent.env_id, agent.name, c.transitions)
+    kept = Resume.of(resume)
+    stages = Stages(kept, *kept.open(agent, demonstrations.digest() if kept.path else ""))
     generator = seeded(agent.seed, agent.device)
     eyes = Eyes.fit(agent.task, c.frame, demonstrations)
     action = agent.units.to_unit(demonstrations.actions).astype(np.float32)
     parts = (*eyes(demonstrations.observations), action)
     data = CloningData(*(torch.tensor(part, device=agent.device) for part in parts))
-    return demonstrations, eyes, data, generator
+    return Lesson(demonstrations, eyes, data, generator, stages, kept.noting(progress))
 
 
 def imitation_loss(output: Tensor, action: Tensor, kind: str) -> Tensor:
@@ -211,6 +238,38 @@ def save(path: str | os.PathLike[str], agent: Any, arrays: dict[str, NDArray]) -
         "config": config_to_dict(agent.config),
     }
     checkpoint.save(path, arrays, description)
+
+
+def input_widths(agent: Any) -> tuple[int, int]:
+    """R and C: how many inputs a cloned agent makes of the robot and of the reading."""
+    space = env_class(agent.env_id)().observation_space
+    blank = {key: np.zeros((1, *part.shape)) for key, part in space.spaces.items()}
+    robot, reading = readings.inputs(agent.task, agent.config.frame, blank)
+    return robot.shape[1], reading.shape[1]
+
+
+def check_arrays(
+    agent: Any,
+    arrays: dict[str, NDArray],
+    modules: Mapping[str, nn.Module],
+    extra: Mapping[str, tuple[int, ...]] | None = None,
+) -> None:
+    """Raise ``ValueError`` unless ``arrays`` are those of a cloned agent with these modules.
+
+    Args:
+        agent: with its config.
+        arrays: as they were stored.
+        modules: by the names under which they are stored; untrained, only their shapes are read.
+        extra: shapes of what else is stored, by name.
+    """
+    shapes: dict[str, tuple[int, ...]] = dict(extra or {})
+    for part, width in zip(("robot", "reading"), input_widths(agent), strict=True):
+        shapes |= {f"eyes.{part}.{what}": (width,) for what in ("mean", "scale")}
+    for name, module in modules.items():
+        shapes |= {f"{name}.{key}": tuple(value.shape) for key, value in module.state_dict().items()}
+    checkpoint.expect(arrays, shapes)
+    for name in ("eyes.robot.scale", "eyes.reading.scale"):
+        require(bool((arrays[name] > 0).all()), f"{name} must be positive", arrays[name])
 
 
 def untrained(name: str) -> RuntimeError:

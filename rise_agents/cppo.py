@@ -32,11 +32,15 @@ from rise_agents.agent import (
     draw_state,
     fresh_state,
     make_config,
+    nearest,
+    require,
     silent,
 )
 from rise_agents.cloning import make_task
 from rise_agents.cppo_config import Config
-from rise_agents.lagrangian import ConstrainedPPO
+from rise_agents.files import StrPath
+from rise_agents.lagrangian import ConstrainedPPO, stored_shapes
+from rise_agents.resume import Resume
 from rise_agents.seeds import episode_seeds
 from rise_agents.vec_env import (
     Bridge,
@@ -46,6 +50,7 @@ from rise_agents.vec_env import (
     random_inputs,
 )
 from rise_agents.workers import keep_freed_memory
+from rise_envs import ENVS
 from rise_envs.task import Task
 
 _STATISTICS_SAMPLES = 2048  # observations that the units of the inputs are taken from
@@ -104,62 +109,58 @@ class CPPO:
         except ValueError as error:
             raise ValueError(f"{error}, or choose frame='raw'") from None
 
-    def learn(self, source: str | gym.Env | VectorEnv | None = None, progress: Progress = silent) -> CPPO:
-        """Train in ``source``: an environment id or a ready environment.
+    def learn(
+        self,
+        source: str | gym.Env | VectorEnv | None = None,
+        progress: Progress = silent,
+        resume: Resume | StrPath | None = None,
+    ) -> CPPO:
+        """Train in ``source``: an environment id or a ready environment; see :class:`rise_agents.agent.Agent`.
 
         None and the agent's own id mean the environment that ``train_env`` names, if it names one.
 
         ``progress`` is told, after every update, ``steps``, ``lambda``, and of the last 100 episodes the mean
-        ``return`` and ``cost``.
+        ``return`` and ``cost``. To go on from ``resume`` to the same weights, an environment must be determined by the
+        seed of its reset.
 
         Raises:
             ValueError: an environment without costs, with unbounded actions, with observations that the frame
                 cannot read, or a vector environment in another autoreset mode than SAME_STEP.
+            CheckpointError: the file to go on from is damaged or of another training.
         """
+        kept = Resume.of(resume)
         if source is not None and not isinstance(source, str):
-            return self._learn(as_vector_env(source), progress)
+            return self._learn(as_vector_env(source), progress, kept, "a ready environment")
         if source in (None, self.env_id):
             source = self.config.train_env or self.env_id
         venv = make_training_env(str(source), self.config.n_envs)
         try:
-            return self._learn(venv, progress)
+            return self._learn(venv, progress, kept, str(source))
         finally:
             venv.close()
 
-    def _learn(self, venv: VectorEnv, progress: Progress) -> CPPO:
+    def _learn(self, venv: VectorEnv, progress: Progress, kept: Resume, source: str) -> CPPO:
         c, bounds = self.config, action_bounds(venv.single_action_space)
         ranks = self._ranks(venv.single_observation_space)
         c.check_batch(venv.num_envs)
-        seeds = episode_seeds("train", self.seed, 0, venv.num_envs)
-        units = readings.Standardiser.fit(random_inputs(venv, self._inputs, seeds, _STATISTICS_SAMPLES))
+        arrays, notes = kept.open(self, source)
+        units = self._units(venv, arrays)
         bridge = Bridge(venv, lambda observation: units(self._inputs(observation)), len(units.mean))
         with _one_thread():
-            ppo = ConstrainedPPO(
-                controller=c.controller(),
-                cost_gamma=c.cost_gamma,
-                cost_gae_lambda=c.cost_gae_lambda,
-                cost_hidden=c.hidden,
-                report=progress,
-                env=bridge,
-                learning_rate=_linear(c.learning_rate, c.final_learning_rate),
-                n_steps=c.n_steps,
-                batch_size=c.batch_size,
-                n_epochs=c.n_epochs,
-                gamma=c.gamma,
-                gae_lambda=c.gae_lambda,
-                clip_range=c.clip_range,
-                ent_coef=c.entropy_coef,
-                max_grad_norm=c.max_grad_norm,
-                policy_kwargs={
-                    "net_arch": list(c.hidden),
-                    "log_std_init": c.log_std,
-                    "optimizer_kwargs": {"eps": 1e-5, "fused": True},  # SB3's ε; fused: one call, not dozens
-                },
-                seed=self.seed,
-                device=self.device,
-            )
-            ppo.set_logger(Logger(folder=None, output_formats=[]))  # SB3's own makes a folder
-            ppo.learn(c.total_steps, log_interval=None)  # type: ignore[arg-type]  # None: nothing to log
+            ppo = self._trainer(bridge, kept.noting(progress))
+
+            def store() -> None:
+                weights, facts = ppo.snapshot()
+                kept.save({**weights, **units.arrays("units")}, facts)
+
+            ppo.at_restart = lambda: store() if kept.due() else None
+            if arrays:
+                restored(ppo, kept, arrays, notes)
+            if ppo.num_timesteps < c.total_steps:
+                left = c.total_steps - ppo.num_timesteps
+                # No logging: None is taken, whatever the annotation says.
+                ppo.learn(left, log_interval=None, reset_num_timesteps=not arrays)  # type: ignore[arg-type]
+                store()
         self._arrays, self._notes = ppo.snapshot()
         self._arrays |= units.arrays("units")
         if bounds is not None:
@@ -167,6 +168,43 @@ class CPPO:
         self._notes["ranks"] = ranks
         self._actor = Actor(self._arrays)
         return self
+
+    def _units(self, venv: VectorEnv, arrays: dict[str, NDArray]) -> readings.Standardiser:
+        """Units of the network's inputs: those of an interrupted training, or of random episodes."""
+        if arrays:
+            return readings.Standardiser.from_arrays(arrays, "units")
+        seeds = episode_seeds("train", self.seed, 0, venv.num_envs)
+        return readings.Standardiser.fit(random_inputs(venv, self._inputs, seeds, _STATISTICS_SAMPLES))
+
+    def _trainer(self, bridge: Bridge, progress: Progress) -> ConstrainedPPO:
+        c = self.config
+        ppo = ConstrainedPPO(
+            controller=c.controller(),
+            cost_gamma=c.cost_gamma,
+            cost_gae_lambda=c.cost_gae_lambda,
+            cost_hidden=c.hidden,
+            report=progress,
+            restart_every=c.restart_every,
+            env=bridge,
+            learning_rate=_linear(c.learning_rate, c.final_learning_rate),
+            n_steps=c.n_steps,
+            batch_size=c.batch_size,
+            n_epochs=c.n_epochs,
+            gamma=c.gamma,
+            gae_lambda=c.gae_lambda,
+            clip_range=c.clip_range,
+            ent_coef=c.entropy_coef,
+            max_grad_norm=c.max_grad_norm,
+            policy_kwargs={
+                "net_arch": list(c.hidden),
+                "log_std_init": c.log_std,
+                "optimizer_kwargs": {"eps": 1e-5, "fused": True},  # SB3's ε; fused: one call, not dozens
+            },
+            seed=self.seed,
+            device=self.device,
+        )
+        ppo.set_logger(Logger(folder=None, output_formats=[]))  # SB3's own makes a folder
+        return ppo
 
     def _ranks(self, space: spaces.Space) -> dict[str, int]:
         """Number of dimensions of each part of one observation; refuses what the frame cannot read."""
@@ -246,20 +284,50 @@ class CPPO:
     def from_checkpoint(
         cls, arrays: dict[str, NDArray], description: dict[str, Any], device: str = "cpu"
     ) -> CPPO:
-        """The agent that :meth:`save` stored."""
+        """The agent that :meth:`save` stored; ``ValueError`` if the arrays are not those of its config."""
         agent = cls(description["env"], description["config"], description["seed"], device)
-        agent._arrays, agent._notes = arrays, description["notes"]
+        agent._check_arrays(arrays)
+        notes = description["notes"]
+        if not all(type(rank) is int and type(key) is str for key, rank in notes["ranks"].items()):
+            raise ValueError("ranks are not whole numbers by key")
+        agent._arrays, agent._notes = arrays, notes
         agent._actor = Actor(arrays)
         return agent
 
+    def _check_arrays(self, arrays: dict[str, NDArray]) -> None:
+        arrays = {name: a for name, a in arrays.items() if not name.startswith("random.")}
+        inputs, outputs = len(arrays["units.mean"]), len(arrays["policy.action_net.bias"])
+        shapes: dict[str, tuple[int, ...]] = {"units.mean": (inputs,), "units.scale": (inputs,)}
+        boxes = "action.low" in arrays
+        if boxes:
+            shapes |= {"action.low": (outputs,), "action.high": (outputs,)}
+        checkpoint.expect(arrays, {**shapes, **stored_shapes(inputs, outputs, self.config.hidden, boxes)})
+        require(
+            bool((arrays["units.scale"] > 0).all()), "units.scale must be positive", arrays["units.scale"]
+        )
+        if boxes:
+            low, high = arrays["action.low"], arrays["action.high"]
+            require(bool((low < high).all()), "action.low must lie below action.high", (low, high))
+
+
+def restored(ppo: ConstrainedPPO, kept: Resume, arrays: dict[str, NDArray], notes: dict[str, Any]) -> None:
+    """Bring ``ppo`` to where an interrupted training was; ``CheckpointError`` if the file lacks a part."""
+    try:
+        ppo.restore(arrays, notes)
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        first = str(error).strip().splitlines()[0]
+        raise checkpoint.CheckpointError(
+            kept.path or "", f"lacks a part of the training ({first})", "remove it to begin anew"
+        ) from None
+
 
 def _check_known(env_id: str) -> None:
-    """Raise ``ValueError`` if an environment to train in, where one is named, is not registered."""
-    try:
-        if env_id:
-            gym.spec(env_id)
-    except gym.error.Error as error:
-        raise ValueError(f"train_env: {error}") from None
+    """Raise ``ValueError`` if an environment to train in, where one is named, is not registered.
+
+    Looked up, not handed to Gymnasium, which would import the module that an id "module:name" names.
+    """
+    if env_id and env_id not in gym.registry:
+        raise ValueError(f"train_env: no environment {env_id!r} is registered: {nearest(env_id, ENVS)}")
 
 
 def _linear(first: float, last: float) -> Callable[[float], float]:

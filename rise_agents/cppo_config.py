@@ -44,6 +44,8 @@ class Config:
         pid_delay: updates that the derivative looks back.
         pid_smoothing: share of the past in the running mean cost.
         lambda_init: the multiplier at the start.
+        restart_every: updates after which all episodes start anew, with seeds of their own. There the training can
+            be stored, and an interrupted one goes on from there.
     """
 
     train_env: str = ""
@@ -71,11 +73,20 @@ class Config:
     pid_delay: int = 10
     pid_smoothing: float = 0.9
     lambda_init: float = 0.0
+    restart_every: int = 20
 
     def __post_init__(self) -> None:
         if self.frame not in FRAMES:
             raise ValueError(f"unknown frame {self.frame!r}: {nearest(str(self.frame), FRAMES)}")
-        for name in ("total_steps", "n_envs", "n_steps", "batch_size", "n_epochs", "pid_delay"):
+        for name in (
+            "total_steps",
+            "n_envs",
+            "n_steps",
+            "batch_size",
+            "n_epochs",
+            "pid_delay",
+            "restart_every",
+        ):
             value = getattr(self, name)
             require(
                 isinstance(value, int) and value >= 1, f"{name} must be a whole number of at least 1", value

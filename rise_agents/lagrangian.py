@@ -14,6 +14,8 @@ Shapes: T steps, B sub-environments, K network inputs.
 
 from __future__ import annotations
 
+import itertools
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
@@ -28,8 +30,16 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from rise_agents.networks import mlp
+from rise_agents.stages import moments, optimiser_state, to_arrays, under
 
 Array = NDArray[np.float32]
+# Our name of each part of the state -> SB3's.
+_PARTS = {
+    "policy": "policy",
+    "optimizer": "policy.optimizer",
+    "cost_critic": "cost_critic",
+    "cost_optimizer": "cost_optimizer",
+}
 
 
 @dataclass(frozen=True)
@@ -84,6 +94,9 @@ class ConstrainedPPO(PPO):
         cost_gae_lambda: of the cost advantage.
         cost_hidden: widths of the cost critic.
         report: called after every update with the figures of the roll-out.
+        restart_every: updates after which all episodes start anew, named by seeds of their own (0: never). What follows
+            depends on :meth:`snapshot` only: from there an interrupted training can go on.
+        at_restart: called there.
         **ppo: arguments of SB3's PPO.
     """
 
@@ -95,9 +108,12 @@ class ConstrainedPPO(PPO):
         cost_gae_lambda: float,
         cost_hidden: Sequence[int],
         report: Callable[[float, dict[str, float]], None],
+        restart_every: int = 0,
+        at_restart: Callable[[], None] = lambda: None,
         **ppo: Any,
     ) -> None:
         self.controller, self.report = controller, report
+        self.restart_every, self.at_restart = restart_every, at_restart
         self.cost_gamma, self.cost_gae_lambda, self.cost_hidden = cost_gamma, cost_gae_lambda, cost_hidden
         self.step_costs: list[NDArray] = []  # of this roll-out, T arrays (B,)
         self.episode_costs: list[float] = []  # of the episodes that ended in this roll-out
@@ -125,7 +141,12 @@ class ConstrainedPPO(PPO):
     def collect_rollouts(
         self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
     ) -> bool:
-        """As SB3's, with costs noted."""
+        """As SB3's, with costs noted, and episodes started anew now and then."""
+        updates = self.num_timesteps // (self.n_steps * self.n_envs)
+        if self.restart_every and updates and updates % self.restart_every == 0:
+            self.at_restart()
+            self._last_obs = self.env.restart(updates // self.restart_every)  # type: ignore[union-attr]
+            self._last_episode_starts = np.ones(self.n_envs, bool)
         self.step_costs, self.episode_costs, self._cut = [], [], []
         return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
 
@@ -187,6 +208,10 @@ class ConstrainedPPO(PPO):
             figures["cost"] = float(np.mean([episode["c"] for episode in episodes]))
         return figures
 
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        """The parts that SB3's ``get_parameters`` and ``set_parameters`` exchange."""
+        return [*_PARTS.values()], []
+
     def snapshot(self) -> tuple[dict[str, NDArray], dict[str, Any]]:
         """All that continued training needs: arrays, and numbers that JSON can hold.
 
@@ -194,24 +219,89 @@ class ConstrainedPPO(PPO):
         (``optimizer.INDEX.NAME`` and ``cost_optimizer.INDEX.NAME``, by position of the parameter) and of the
         global generators that SB3 draws from.
         """
-        parts = {"policy": self.policy.state_dict(), "cost_critic": self.cost_critic.state_dict()}
-        for name, optimizer in (
-            ("optimizer", self.policy.optimizer),
-            ("cost_optimizer", self.cost_optimizer),
-        ):
-            moments = optimizer.state_dict()["state"]
-            parts[name] = {f"{i}.{key}": value for i, each in moments.items() for key, value in each.items()}
-        arrays = {
-            f"{part}.{name}": value.detach().cpu().numpy().copy()
-            for part, values in parts.items()
-            for name, value in values.items()
-        }
+        arrays: dict[str, NDArray] = {}
+        for name, part in self._parts().items():
+            is_module = isinstance(part, torch.nn.Module)
+            arrays |= to_arrays(part, name) if is_module else moments(part, name)
         _, words, position, *_ = np.random.get_state()  # noqa: NPY002 - the generator that SB3 shuffles with
         arrays |= {"random.torch": torch.get_rng_state().numpy(), "random.numpy": np.asarray(words)}
+        if self.device.type == "cuda":
+            arrays["random.cuda"] = torch.cuda.get_rng_state(self.device).numpy()
         notes = {
             "steps": self.num_timesteps,
+            "updates": self._n_updates,
             "controller": asdict(self.controller),
             "numpy_position": int(position),
             "cost_rng": self.cost_rng.bit_generator.state,
+            "episodes": [{key: each[key] for key in "rlc"} for each in self.ep_info_buffer or []],
         }
         return arrays, notes
+
+    def restore(self, arrays: dict[str, NDArray], notes: dict[str, Any]) -> None:
+        """Go on from what :meth:`snapshot` gave, by ``learn(..., reset_num_timesteps=False)``."""
+        states: dict[str, Any] = {}
+        for name, part in self._parts().items():
+            is_module = isinstance(part, torch.nn.Module)
+            states[_PARTS[name]] = under(arrays, name) if is_module else optimiser_state(part, arrays, name)
+        self.set_parameters(states)
+        self.num_timesteps, self._n_updates = int(notes["steps"]), int(notes["updates"])
+        stored = notes["controller"]
+        self.controller = Controller(**{**stored, "history": tuple(stored["history"])})
+        self.cost_rng.bit_generator.state = notes["cost_rng"]
+        self.ep_info_buffer = deque(notes["episodes"], maxlen=self._stats_window_size)
+        self.ep_success_buffer = deque(maxlen=self._stats_window_size)
+        words = arrays["random.numpy"].astype(np.uint32)
+        np.random.set_state(("MT19937", words, notes["numpy_position"], 0, 0.0))  # noqa: NPY002
+        torch.set_rng_state(torch.from_numpy(arrays["random.torch"].copy()))
+        if self.device.type == "cuda":
+            torch.cuda.set_rng_state(torch.from_numpy(arrays["random.cuda"].copy()), self.device)
+
+    def _parts(self) -> dict[str, Any]:
+        return {
+            "policy": self.policy,
+            "optimizer": self.policy.optimizer,
+            "cost_critic": self.cost_critic,
+            "cost_optimizer": self.cost_optimizer,
+        }
+
+
+def stored_shapes(
+    inputs: int, outputs: int, hidden: Sequence[int], boxes: bool
+) -> dict[str, tuple[int, ...]]:
+    """Names and shapes of the floats that :meth:`ConstrainedPPO.snapshot` gives.
+
+    Args:
+        inputs: K.
+        outputs: A, or the number of discrete actions.
+        hidden: widths of all three networks.
+        boxes: whether actions are continuous.
+    """
+    body, last = [inputs, *hidden], [hidden[-1]]
+    parameters = {
+        "policy": {
+            **({"log_std": (outputs,)} if boxes else {}),
+            **_layers("mlp_extractor.policy_net.{}", body),
+            **_layers("mlp_extractor.value_net.{}", body),
+            **_layers("action_net", [*last, outputs]),
+            **_layers("value_net", [*last, 1]),
+        },
+        "cost_critic": _layers("{}", [*body, 1]),
+    }
+    shapes: dict[str, tuple[int, ...]] = {}
+    for name, optimizer in (("policy", "optimizer"), ("cost_critic", "cost_optimizer")):
+        shapes |= {f"{name}.{key}": shape for key, shape in parameters[name].items()}
+        for i, shape in enumerate(parameters[name].values()):
+            shapes |= {f"{optimizer}.{i}.{key}": shape for key in ("exp_avg", "exp_avg_sq")}
+            shapes[f"{optimizer}.{i}.step"] = ()
+    return shapes
+
+
+def _layers(name: str, widths: Sequence[int]) -> dict[str, tuple[int, ...]]:
+    """Shapes of the fully connected layers of a ``Sequential`` with an activation after each, or of one layer."""
+    shapes: dict[str, tuple[int, ...]] = {}
+    for i, (width, following) in enumerate(itertools.pairwise(widths)):
+        shapes |= {
+            f"{name.format(2 * i)}.weight": (following, width),
+            f"{name.format(2 * i)}.bias": (following,),
+        }
+    return shapes

@@ -16,9 +16,12 @@ from torch import Tensor, nn
 from rise_agents import cloning
 from rise_agents.agent import Progress, State, make_config, silent
 from rise_agents.cloning import ActionUnits, CloningConfig, Eyes
+from rise_agents.files import StrPath
 from rise_agents.networks import mlp
 from rise_agents.readings import as_batch, check_finite
-from rise_agents.training import Forward, fit, layers_of, standardised, to_arrays
+from rise_agents.resume import Resume
+from rise_agents.stages import to_arrays
+from rise_agents.training import Forward, fit, layers_of, standardised
 
 Config = CloningConfig
 
@@ -45,24 +48,28 @@ class PCBC:
         self.task, self.units = cloning.make_task(env_id), ActionUnits.of(env_id)
         self._arrays: dict[str, NDArray] = {}
 
-    def learn(self, source: Any, progress: Progress = silent) -> PCBC:
-        """Clone :class:`rise_agents.demonstrations.Demonstrations`."""
+    def learn(self, source: Any, progress: Progress = silent, resume: Resume | StrPath | None = None) -> PCBC:
+        """Clone :class:`rise_agents.demonstrations.Demonstrations`; see :class:`rise_agents.agent.Agent`."""
         c = self.config
-        _, eyes, data, generator = cloning.begin(self, source)
+        lesson = cloning.begin(self, source, progress, resume)
+        data = lesson.data
         seen = torch.cat((data.robot, data.reading), -1)
-        policy = mlp(seen.shape[1], c.hidden, cloning.output_size(data.action.shape[1], c.loss))
-        policy.to(self.device)
+        policy = self._network(seen.shape[1]).to(self.device)
         fit(
-            policy.parameters(),
+            lesson.stages["policy"],
+            policy,
             lambda seen, action: policy_loss(policy, seen, action, c.loss),
             (seen, data.action),
             updates=c.updates,
             batch_size=c.batch_size,
             learning_rate=c.learning_rate,
-            generator=generator,
-            progress=progress,
+            generator=lesson.generator,
+            progress=lesson.progress,
         )
-        return self._use({**eyes.arrays(), **to_arrays(policy, "policy")})
+        return self._use({**lesson.eyes.arrays(), **to_arrays(policy, "policy")})
+
+    def _network(self, inputs: int) -> nn.Module:
+        return mlp(inputs, self.config.hidden, cloning.output_size(self.units.size, self.config.loss))
 
     def _use(self, arrays: dict[str, NDArray]) -> PCBC:
         self._arrays = arrays
@@ -97,8 +104,12 @@ class PCBC:
 
     @classmethod
     def from_checkpoint(cls, arrays: dict[str, NDArray], description: dict[str, Any], device: str) -> PCBC:
-        """The agent that :meth:`save` stored."""
-        return cls(description["env"], description["config"], description["seed"], device)._use(arrays)
+        """The agent that :meth:`save` stored; ``ValueError`` if the arrays are not those of its config."""
+        agent = cls(description["env"], description["config"], description["seed"], device)
+        with torch.device("meta"):
+            modules = {"policy": agent._network(sum(cloning.input_widths(agent)))}
+        cloning.check_arrays(agent, arrays, modules)
+        return agent._use(arrays)
 
 
 def policy_loss(policy: nn.Module, seen: Tensor, action: Tensor, kind: str) -> dict[str, Tensor]:

@@ -37,10 +37,13 @@ from rise_agents.agent import (
     require_widths,
     silent,
 )
-from rise_agents.cloning import ActionUnits, CloningConfig, CloningData, Eyes
+from rise_agents.cloning import ActionUnits, CloningConfig, Eyes, Lesson
 from rise_agents.draws import NormalDraws
+from rise_agents.files import StrPath
 from rise_agents.networks import LOG_SIGMA_RANGE, Encoder, gaussian_kl, mlp, reparameterise
-from rise_agents.training import Forward, fit, layers_of, standardised, to_arrays
+from rise_agents.resume import Resume
+from rise_agents.stages import to_arrays
+from rise_agents.training import Forward, fit, layers_of, standardised
 
 _ONE = np.uint64(1)
 _LOG_SIGMA_RANGE = tuple(np.float32(bound) for bound in LOG_SIGMA_RANGE)
@@ -148,12 +151,13 @@ class Rise:
         self._rng = np.random.default_rng(seed)
         self._arrays: dict[str, NDArray] = {}
 
-    def learn(self, source: Any, progress: Progress = silent) -> Rise:
-        """Algorithm 1 on :class:`rise_agents.demonstrations.Demonstrations`."""
+    def learn(self, source: Any, progress: Progress = silent, resume: Resume | StrPath | None = None) -> Rise:
+        """Algorithm 1 on :class:`rise_agents.demonstrations.Demonstrations`; see :class:`rise_agents.agent.Agent`."""
         c = self.config
-        demonstrations, eyes, data, generator = cloning.begin(self, source)
+        lesson = cloning.begin(self, source, progress, resume)
+        data, eyes, tell = lesson.data, lesson.eyes, lesson.progress
         # Standard units → units of the reading noise: what the decoder answers in.
-        sample = demonstrations.subsample(20_000)
+        sample = lesson.demonstrations.subsample(20_000)
         noise = readings.reading_units(self.task, c.frame, sample)
         ratio = torch.from_numpy((eyes.reading.scale / np.maximum(noise, 1e-9)).astype(np.float32)).to(
             self.device
@@ -161,38 +165,39 @@ class Rise:
         share = c.vae_updates / (c.vae_updates + c.updates)
 
         vae = VAE(data.reading.shape[1], c).to(self.device)
-        self._fit_vae(vae, data, ratio, generator, lambda done, figures: progress(share * done, figures))
+        self._fit_vae(vae, lesson, ratio, lambda done, figures: tell(share * done, figures))
         with torch.no_grad():
             mu, log_sigma = vae.encoder(data.reading)
         # Stage 2 sees samples of the latent with unit scale, which only renames its axes. The scale is that of
         # the samples, not of their means: where the posterior falls back to the prior all means coincide.
         spread = (mu.var(0) + (2 * log_sigma).exp().mean(0)).sqrt()
-        width = data.robot.shape[1] + c.latent
-        policy = mlp(width, c.hidden, cloning.output_size(data.action.shape[1], c.loss)).to(self.device)
+        policy = self._policy_network(data.robot.shape[1]).to(self.device)
         self._fit_policy(
             policy,
-            data,
+            lesson,
             (mu / spread, log_sigma - spread.log()),
-            generator,
-            lambda done, figures: progress(share + (1 - share) * done, figures),
+            lambda done, figures: tell(share + (1 - share) * done, figures),
         )
         weights = {**to_arrays(vae, "vae"), **to_arrays(policy, "policy")}
         scale = {"vae.spread": spread.cpu().numpy(), "vae.ratio": ratio.cpu().numpy()}
         return self._use({**eyes.arrays(), **weights, **scale})
 
-    def _fit_vae(
-        self, vae: VAE, data: CloningData, ratio: Tensor, generator: torch.Generator, progress: Progress
-    ) -> None:
+    def _policy_network(self, robot: int) -> nn.Module:
         c = self.config
+        return mlp(robot + c.latent, c.hidden, cloning.output_size(self.units.size, c.loss))
+
+    def _fit_vae(self, vae: VAE, lesson: Lesson, ratio: Tensor, progress: Progress) -> None:
+        c, generator, seen = self.config, lesson.generator, lesson.data.reading
 
         def loss(reading: Tensor, target: Tensor) -> dict[str, Tensor]:
             epsilon = torch.randn((len(reading), c.latent), generator=generator, device=generator.device)
             return vae.loss(reading, target, epsilon, c.beta)
 
         fit(
-            vae.parameters(),
+            lesson.stages["vae"],
+            vae,
             loss,
-            (data.reading, data.reading * ratio),
+            (seen, seen * ratio),
             updates=c.vae_updates,
             batch_size=c.vae_batch_size,
             learning_rate=c.learning_rate,
@@ -201,14 +206,9 @@ class Rise:
         )
 
     def _fit_policy(
-        self,
-        policy: nn.Module,
-        data: CloningData,
-        posterior: tuple[Tensor, Tensor],
-        generator: torch.Generator,
-        progress: Progress,
+        self, policy: nn.Module, lesson: Lesson, posterior: tuple[Tensor, Tensor], progress: Progress
     ) -> None:
-        c = self.config
+        c, generator, data = self.config, lesson.generator, lesson.data
 
         def loss(robot: Tensor, mu: Tensor, log_sigma: Tensor, action: Tensor) -> dict[str, Tensor]:
             shape = (c.n_samples, len(mu), c.latent)
@@ -216,7 +216,8 @@ class Rise:
             return policy_loss(policy, robot, mu, log_sigma, action, epsilon, c.loss)
 
         fit(
-            policy.parameters(),
+            lesson.stages["policy"],
+            policy,
             loss,
             (data.robot, *posterior, data.action),
             updates=c.updates,
@@ -298,5 +299,12 @@ class Rise:
 
     @classmethod
     def from_checkpoint(cls, arrays: dict[str, NDArray], description: dict[str, Any], device: str) -> Rise:
-        """The agent that :meth:`save` stored."""
-        return cls(description["env"], description["config"], description["seed"], device)._use(arrays)
+        """The agent that :meth:`save` stored; ``ValueError`` if the arrays are not those of its config."""
+        agent = cls(description["env"], description["config"], description["seed"], device)
+        robot, reading = cloning.input_widths(agent)
+        with torch.device("meta"):
+            modules = {"vae": VAE(reading, agent.config), "policy": agent._policy_network(robot)}
+        extra = {"vae.spread": (agent.config.latent,), "vae.ratio": (reading,)}
+        cloning.check_arrays(agent, arrays, modules, extra)
+        require(bool((arrays["vae.spread"] > 0).all()), "vae.spread must be positive", arrays["vae.spread"])
+        return agent._use(arrays)

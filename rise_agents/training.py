@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+
+from rise_agents.stages import Stage
 
 # Maps a batch, (B, …) each, to named terms, of which ``loss`` is minimised.
 Loss = Callable[..., dict[str, Tensor]]
@@ -17,7 +19,8 @@ _ZERO = np.float32(0)
 
 
 def fit(
-    parameters: Iterable[nn.Parameter],
+    stage: Stage,
+    module: nn.Module,
     loss: Loss,
     data: Sequence[Tensor],
     *,
@@ -30,7 +33,8 @@ def fit(
     """Adam with a cosine schedule to zero over shuffled passes through the data.
 
     Args:
-        parameters: what is trained.
+        stage: where this training may have been interrupted, and keeps its state.
+        module: what is trained.
         loss: called as ``loss(*rows)`` with a batch of each of ``data``.
         data: tensors (T, …) of the same length, on the device of ``generator``.
         updates: gradient steps.
@@ -39,15 +43,17 @@ def fit(
         generator: draws the order of the rows.
         progress: told the share done and the terms, about a hundred times.
     """
-    optimiser = torch.optim.Adam(parameters, lr=learning_rate, fused=True)
+    optimiser = torch.optim.Adam(module.parameters(), lr=learning_rate, fused=True)
     total = len(data[0])
     batch_size = min(batch_size, total)
     per_pass = total // batch_size
     every = max(1, updates // 100)
-    for update in range(updates):
+    begun, epoch = stage.restore(module, optimiser, generator, updates)
+    for update in range(begun, updates):
         start = (update % per_pass) * batch_size
-        if start == 0:  # rows are gathered once a pass, so that batches are views
-            order = torch.randperm(total, generator=generator, device=generator.device)
+        if start == 0 or update == begun:  # rows are gathered once a pass, so that batches are views
+            epoch = generator.get_state() if start == 0 else epoch
+            order = _order(total, generator if start == 0 else _at(epoch, generator))
             shuffled = [part.index_select(0, order) for part in data]
         for group in optimiser.param_groups:
             group["lr"] = 0.5 * learning_rate * (1 + math.cos(math.pi * update / updates))
@@ -57,20 +63,27 @@ def fit(
         optimiser.step()
         if (update + 1) % every == 0 or update + 1 == updates:
             progress((update + 1) / updates, {name: float(term.detach()) for name, term in terms.items()})
+        if stage.due() and update + 1 < updates:
+            stage.keep(update + 1, module, optimiser, generator, epoch)
+    if begun < updates:
+        stage.keep(updates, module, None, generator, epoch)
 
 
-def to_arrays(module: nn.Module, name: str) -> dict[str, NDArray[np.float32]]:
-    """The weights of ``module`` as arrays, under ``name``."""
-    return {
-        f"{name}.{key}": value.detach().cpu().numpy().copy() for key, value in module.state_dict().items()
-    }
+def _order(rows: int, generator: torch.Generator) -> Tensor:
+    return torch.randperm(rows, generator=generator, device=generator.device)
+
+
+def _at(state: Tensor, like: torch.Generator) -> torch.Generator:
+    generator = torch.Generator(device=like.device)
+    generator.set_state(state)
+    return generator
 
 
 Layer = tuple[NDArray[np.float64], NDArray[np.float64]]  # weights (inputs, outputs) and bias (outputs,)
 
 
 def layers_of(arrays: dict[str, NDArray], name: str) -> list[Layer]:
-    """The fully connected layers that :func:`to_arrays` stored under ``name``, first to last."""
+    """The fully connected layers that :func:`rise_agents.stages.to_arrays` stored under ``name``, first to last."""
     own = [key.removeprefix(f"{name}.") for key in arrays if key.startswith(f"{name}.")]
     numbers = sorted({int(key.split(".")[0]) for key in own if re.fullmatch(r"\d+\.weight", key)})
     stored = [(arrays[f"{name}.{i}.weight"].T, arrays[f"{name}.{i}.bias"]) for i in numbers]

@@ -13,15 +13,17 @@ import importlib
 import inspect
 import multiprocessing
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
+from rise_agents.pool import end_with_parent
 from rise_agents.seeds import episode_seeds
 from rise_envs.cost import checked_cost, cost_of
 
@@ -44,10 +46,15 @@ def make_training_env(env_id: str, num_envs: int, **kwargs: Any) -> VectorEnv:
             autoreset_mode=AutoresetMode.SAME_STEP,
             **kwargs,
         )
-    alone = num_envs == 1 or multiprocessing.current_process().daemon
-    vector_kwargs = {"autoreset_mode": AutoresetMode.SAME_STEP}
-    mode = "sync" if alone else "async"
-    return gym.make_vec(env_id, num_envs, vectorization_mode=mode, vector_kwargs=vector_kwargs, **kwargs)
+    makers = [partial(_make, env_id, kwargs)] * num_envs
+    if num_envs == 1 or multiprocessing.current_process().daemon:
+        return SyncVectorEnv(makers, autoreset_mode=AutoresetMode.SAME_STEP)
+    return AsyncVectorEnv(makers, autoreset_mode=AutoresetMode.SAME_STEP)
+
+
+def _make(env_id: str, kwargs: dict[str, Any]) -> gym.Env:
+    end_with_parent()  # a sub-environment's process would wait for ever for one that was killed
+    return gym.make(env_id, **kwargs)
 
 
 def _resets_in_step(entry: Any) -> bool:
@@ -119,8 +126,15 @@ class Bridge(VecEnv):
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Name the episodes of the next reset: the first training episodes of run ``seed``."""
-        self._seeds = episode_seeds("train", seed or 0, 0, self.num_envs).tolist()
+        self._run = seed or 0
+        self._seeds = episode_seeds("train", self._run, 0, self.num_envs).tolist()
         return self._seeds
+
+    def restart(self, number: int) -> NDArray[np.float32]:
+        """Start all episodes anew, named by the run's seed and ``number``; encoded observations (B, K)."""
+        first = number * self.num_envs
+        self._seeds = episode_seeds("train", self._run, first, self.num_envs).tolist()
+        return self.reset()
 
     def reset(self) -> NDArray[np.float32]:
         """Start all episodes; encoded observations (B, K)."""

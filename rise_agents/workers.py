@@ -1,12 +1,10 @@
-"""Worker processes that start clean and use one thread each."""
+"""Cores, threads and memory of this process and of those that it starts."""
 
 from __future__ import annotations
 
 import ctypes
-import multiprocessing
 import os
 import sys
-from concurrent.futures import ProcessPoolExecutor
 
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
@@ -36,16 +34,3 @@ def keep_freed_memory() -> None:
         trim_threshold, mmap_threshold = -1, -3  # as malloc.h numbers them
         mallopt(trim_threshold, 256 << 20)
         mallopt(mmap_threshold, 32 << 20)  # the largest that it accepts
-
-
-def make_pool(workers: int) -> ProcessPoolExecutor:
-    """A pool of freshly started processes (a fork would copy the parent's threads and engines)."""
-    limit_threads()
-    return ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
-
-
-def stop(pool: ProcessPoolExecutor) -> None:
-    """End the workers at once: their unfinished outputs are temporary files, nothing is lost."""
-    for process in list((getattr(pool, "_processes", None) or {}).values()):
-        process.terminate()
-    pool.shutdown(wait=False, cancel_futures=True)

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 
 import gymnasium as gym
 import numpy as np
 import pytest
-import safetensors.numpy as st
 
-from rise_agents.demonstrations import ARRAYS, CARD, DatasetError, generate, load, minari_io
+from rise_agents import archive
+from rise_agents.demonstrations import CARD, DATA, DatasetError, generate, load, minari_io
 from rise_agents.demonstrations.__main__ import main
 
 VEHICLE = "RISE-GroundVehicle-v0"
@@ -88,13 +87,10 @@ def test_first_and_subsample(vehicle_demonstrations):
 
 
 def _forge(folder, change):
-    """Change the arrays and make the card's digest fit, as somebody who means harm would."""
-    arrays = st.load((folder / ARRAYS).read_bytes())
-    card = json.loads((folder / CARD).read_text())
+    """Change arrays and card and make the digest fit, as somebody who means harm would."""
+    arrays, card = archive.read(folder / DATA, "demonstrations")
     change(arrays, card)
-    body = st.save(arrays)
-    (folder / ARRAYS).write_bytes(body)
-    (folder / CARD).write_text(json.dumps({**card, "sha256": hashlib.sha256(body).hexdigest()}))
+    archive.write(folder / DATA, "demonstrations", arrays, card)
 
 
 @pytest.mark.parametrize(
@@ -109,7 +105,11 @@ def _forge(folder, change):
         (lambda a, c: a.update(rewards=a["rewards"][:-1].copy()), "rewards"),
         (lambda a, c: a.pop("observations.obstacle"), "observations.obstacle"),
         (lambda a, c: c.update(env="os:system"), "unknown environment"),
-        (lambda a, c: c.update(schema=99), "schema"),
+        (lambda a, c: c.update(env=["RISE-GroundVehicle-v0"]), "unknown environment"),
+        (lambda a, c: c["params"].update(max_speed=99.0), "was recorded in"),
+        (lambda a, c: a.update(more=a["rewards"]), "unknown: more"),
+        (lambda a, c: a.update(seeds=a["seeds"].astype(np.float64)), "seeds are float64"),
+        (lambda a, c: a.update(seeds=a["seeds"][:0], offsets=a["offsets"][:1]), "number of episodes"),
     ],
 )
 def test_forged_sets_are_refused(stored, change, reason):
@@ -119,13 +119,19 @@ def test_forged_sets_are_refused(stored, change, reason):
 
 
 def test_damaged_and_missing_sets_are_refused(stored, tmp_path):
-    body = bytearray((stored / ARRAYS).read_bytes())
+    body = bytearray((stored / DATA).read_bytes())
     body[len(body) // 2] ^= 4
-    (stored / ARRAYS).write_bytes(body)
+    (stored / DATA).write_bytes(body)
     with pytest.raises(DatasetError, match="damaged"):
         load(stored)
-    with pytest.raises(DatasetError, match="no demonstration set"):
+    with pytest.raises(DatasetError, match=r"nowhere.*does not exist"):
         load(tmp_path / "nowhere")
+
+
+def test_the_card_for_people_is_not_believed(stored, vehicle_demonstrations):
+    card = json.loads((stored / CARD).read_text())
+    (stored / CARD).write_text(json.dumps({**card, "expert": "somebody else", "env": "RISE-SafePanda-v0"}))
+    assert load(stored).card["expert"] == vehicle_demonstrations.card["expert"] == "cbf"
 
 
 def test_minari_round_trip(vehicle_demonstrations, tmp_path, monkeypatch):
@@ -155,3 +161,27 @@ def test_command_line(tmp_path, capsys):
     assert "seed must be in" in capsys.readouterr().err
     assert main(["--env", VEHICLE, "--minari", "no good id", "--out", str(tmp_path / "b")]) == 2
     assert not (tmp_path / "b").exists()
+
+
+def test_an_interrupted_recording_goes_on(tmp_path):
+    """What is recorded is not recorded again, and the set is the same as in one go."""
+    whole = generate(VEHICLE, "cbf", 120)
+
+    def interrupt(kept, tried):
+        if kept >= 50:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        generate(VEHICLE, "cbf", 120, finished=interrupt, parts=tmp_path)
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+    assert before
+    again = generate(VEHICLE, "cbf", 120, parts=tmp_path)
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+    for name, array in whole.arrays().items():
+        np.testing.assert_array_equal(again.arrays()[name], array)
+
+
+def test_pieces_of_another_recording_are_refused(tmp_path):
+    generate(VEHICLE, "cbf", 10, parts=tmp_path)
+    with pytest.raises(DatasetError, match=r"0000000.rise.*'cbf'.*'mpc'"):
+        generate(VEHICLE, "mpc", 10, parts=tmp_path)

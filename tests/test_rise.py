@@ -10,7 +10,7 @@ from torch.distributions import Independent, Normal, kl_divergence
 from rise_agents import cloning, make_agent
 from rise_agents.networks import Encoder, gaussian_kl, mlp, reparameterise
 from rise_agents.rise import VAE, Config, Rise, policy_loss
-from rise_agents.training import to_arrays
+from rise_agents.stages import to_arrays
 
 VEHICLE = "RISE-GroundVehicle-v0"
 BRIEF = {"updates": 40, "vae_updates": 40, "batch_size": 32, "vae_batch_size": 32, "n_samples": 3}
@@ -76,9 +76,9 @@ def test_stage_two_leaves_the_vae_as_it_was(vehicle_demonstrations, monkeypatch)
     seen = {}
     fit_policy = Rise._fit_policy
 
-    def spy(self, policy, data, posterior, generator, progress):
+    def spy(self, policy, lesson, posterior, progress):
         assert not any(part.requires_grad for part in posterior)
-        fit_policy(self, policy, data, posterior, generator, progress)
+        fit_policy(self, policy, lesson, posterior, progress)
 
     fit_vae = Rise._fit_vae
 

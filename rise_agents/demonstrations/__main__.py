@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,6 +16,8 @@ from rise_agents.agent import nearest
 from rise_agents.cli import Parser, prepare_folder
 from rise_agents.demonstrations.minari_io import check_id, export
 from rise_agents.experts import expert_names
+from rise_agents.files import sole_user, sweep
+from rise_agents.pool import TaskError
 from rise_agents.seeds import episode_seeds
 from rise_agents.workers import available_cores
 from rise_envs import ENVS
@@ -25,7 +28,8 @@ examples:
   python -m rise_agents.demonstrations --env RISE-SafePanda-v0 --expert cbf --episodes 500 --out demos/panda
   python -m rise_agents.demonstrations --env RISE-GroundVehicle-v0 --out demos/vehicle --minari rise/vehicle-v0
 
-The result is the same for any number of workers.
+The result is the same for any number of workers. A recording that was stopped goes on where it was: give the same
+command again.
 """
 
 
@@ -59,7 +63,7 @@ def checked(argv: Sequence[str] | None) -> argparse.Namespace:
         if getattr(a, name) is not None and getattr(a, name) < 1:
             raise ValueError(f"--{name} must be at least 1, got {getattr(a, name)}")
     episode_seeds("train", a.seed, 0, a.episodes)  # raises where the seeds do not suffice
-    if (a.out / demonstrations.CARD).exists():
+    if (a.out / demonstrations.DATA).exists():
         raise ValueError(f"{a.out} holds a demonstration set already: name another folder or remove it")
     if a.minari:
         check_id(a.minari)
@@ -76,8 +80,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"rise_agents.demonstrations: {error}", file=sys.stderr)
         return 2
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    pieces = a.out / ".parts"
     try:
-        with Progress(*columns, console=console, disable=not console.is_terminal) as bars:
+        with sole_user(a.out), Progress(*columns, console=console, disable=not console.is_terminal) as bars:
+            sweep(a.out)
             bar = bars.add_task(f"{a.expert} on {a.env}", total=a.episodes)
             made = demonstrations.generate(
                 a.env,
@@ -86,14 +92,19 @@ def main(argv: Sequence[str] | None = None) -> int:
                 a.seed,
                 a.workers or available_cores(),
                 finished=lambda kept, tried: bars.update(bar, completed=kept),
+                parts=pieces,
             )
-        made.save(a.out)
-        if a.minari:
-            export(made, a.minari)
+            made.save(a.out)
+            shutil.rmtree(pieces)
+            if a.minari:
+                export(made, a.minari)
     except KeyboardInterrupt:
-        print("\nrise_agents.demonstrations: interrupted, nothing was written", file=sys.stderr)
+        print(
+            "\nrise_agents.demonstrations: interrupted; what is recorded is kept, run the command again to go on",
+            file=sys.stderr,
+        )
         return 130
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, TaskError) as error:
         print(f"rise_agents.demonstrations: {error}", file=sys.stderr)
         return 1
     card = made.card

@@ -1,7 +1,8 @@
 """A set of demonstrations: what it holds, how it is stored, checked and loaded.
 
-A set is a folder of two files: ``demonstrations.safetensors`` (flat arrays and episode offsets) and
-``card.json`` (environment and its parameters, expert, seeds, versions, rejection rate, SHA-256 of the arrays).
+A set is a folder with ``demonstrations.rise``: flat arrays, episode offsets and the card (environment and its
+parameters, expert, seeds, versions, rejection rate) under one SHA-256. ``card.json`` beside it repeats the card for
+people and is never read.
 """
 
 from __future__ import annotations
@@ -9,20 +10,25 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import safetensors.numpy as st
 from numpy.typing import NDArray
 
 import rise_envs
-from rise_agents.checkpoint import replace_file
+from rise_agents import archive
+from rise_agents.agent import config_to_dict
+from rise_agents.files import replace_file
 from rise_envs.task import env_class
 
-SCHEMA = 1
-ARRAYS, CARD = "demonstrations.safetensors", "card.json"
+KIND = "demonstrations"
+DATA, CARD = "demonstrations.rise", "card.json"
+NUMBERS = {
+    **dict.fromkeys(("actions", "rewards", "costs"), np.float64),
+    **dict.fromkeys(("offsets", "seeds", "expert"), np.int64),
+}
 OBSERVATIONS = ("observation", "achieved_goal", "desired_goal", "obstacle")
 
 
@@ -92,16 +98,24 @@ class Demonstrations:
         """Everything that is stored as numbers, by name."""
         parts = {f"observations.{key}": value for key, value in self.observations.items()}
         parts |= {f"final.{key}": value for key, value in self.final.items()}
-        for name in ("actions", "rewards", "costs", "offsets", "seeds", "expert"):
+        for name in NUMBERS:
             parts[name] = getattr(self, name)
         return parts
 
+    def digest(self) -> str:
+        """Stands for all numbers of the set: the same numbers, the same digest."""
+        whole = hashlib.sha256(self.env_id.encode())
+        for name, array in sorted(self.arrays().items()):
+            whole.update(f"{name} {array.dtype} {array.shape}".encode())
+            whole.update(np.ascontiguousarray(array).data)
+        return whole.hexdigest()
+
     def save(self, folder: str | os.PathLike[str]) -> None:
-        """Store the set; the card is written last, so a folder with a card is complete."""
-        body = st.save({name: np.ascontiguousarray(array) for name, array in self.arrays().items()})
-        card = {**self.card, "schema": SCHEMA, "env": self.env_id, "sha256": hashlib.sha256(body).hexdigest()}
-        replace_file(Path(folder) / ARRAYS, body)
-        replace_file(Path(folder) / CARD, (json.dumps(card, indent=2, sort_keys=True) + "\n").encode())
+        """Store the set, whole or not at all."""
+        card = {**self.card, "env": self.env_id}
+        text = json.dumps(card, indent=2, sort_keys=True) + "\n"
+        replace_file(Path(folder) / CARD, text.encode())  # first: a folder with the data is complete
+        archive.write(Path(folder) / DATA, KIND, self.arrays(), card)
 
 
 def load(folder: str | os.PathLike[str]) -> Demonstrations:
@@ -110,70 +124,82 @@ def load(folder: str | os.PathLike[str]) -> Demonstrations:
     Raises:
         DatasetError: anything about it is missing or wrong.
     """
-    folder = Path(folder)
+    path = Path(folder) / DATA
     try:
-        card = json.loads((folder / CARD).read_text())
-        body = (folder / ARRAYS).read_bytes()
-    except OSError as error:
-        raise DatasetError(f"{folder}: no demonstration set ({error.strerror}: {error.filename})") from None
-    except ValueError as error:
-        raise DatasetError(f"{folder / CARD}: not readable as JSON ({error})") from None
-    if not isinstance(card, dict) or card.get("schema") != SCHEMA:
-        raise DatasetError(f"{folder / CARD}: not a card of schema {SCHEMA}")
-    if hashlib.sha256(body).hexdigest() != card.get("sha256"):
-        raise DatasetError(f"{folder / ARRAYS}: damaged, its SHA-256 is not the card's")
+        arrays, card = archive.read(path, KIND)
+    except archive.ArchiveError as error:
+        raise DatasetError(f"{path}: {error.reason}; record the demonstrations again") from None
     try:
-        arrays = st.load(body)
-        demonstrations = from_arrays(str(card["env"]), arrays, card)
+        return from_arrays(card.pop("env", None), arrays, card)
     except DatasetError as error:
-        raise DatasetError(f"{folder}: {error}") from None
-    except Exception as error:
-        raise DatasetError(f"{folder}: arrays or card lack an entry ({error})") from None
-    return demonstrations
+        raise DatasetError(f"{path}: {error}") from None
+    except Exception as error:  # a right digest says who wrote a file, not that it makes sense
+        raise DatasetError(f"{path}: arrays or card lack an entry ({error})") from None
 
 
 def from_arrays(env_id: str, arrays: dict[str, NDArray], card: dict[str, Any]) -> Demonstrations:
     """A checked set from named arrays, the inverse of :meth:`Demonstrations.arrays`."""
+    names = {f"{group}.{key}" for group in ("observations", "final") for key in OBSERVATIONS} | set(NUMBERS)
+    if set(arrays) != names:
+        raise DatasetError(f"arrays are missing or unknown: {', '.join(sorted(set(arrays) ^ names))}")
     grouped: dict[str, Any] = {
         group: {key: arrays[f"{group}.{key}"] for key in OBSERVATIONS} for group in ("observations", "final")
     }
-    rest: dict[str, Any] = {
-        name: arrays[name] for name in ("actions", "rewards", "costs", "offsets", "seeds", "expert")
-    }
+    rest: dict[str, Any] = {name: arrays[name] for name in NUMBERS}
     demonstrations = Demonstrations(env_id=env_id, **grouped, **rest, card=card)
     check(demonstrations)
     return demonstrations
 
 
+def params_of(env_id: str) -> dict[str, Any]:
+    """The constants of a registered environment, where it publishes them."""
+    env = env_class(env_id)()
+    env.close()
+    params = getattr(env, "params", None)
+    return config_to_dict(params) if is_dataclass(params) else {}
+
+
 def check(d: Demonstrations) -> None:
     """Raise :class:`DatasetError` unless every array has the shape, bounds and meaning it claims."""
-    if d.env_id not in rise_envs.ENVS:
+    # Looked up by name in our registry: what a file says of an environment is compared, never built.
+    if not isinstance(d.env_id, str) or d.env_id not in rise_envs.ENVS:
         raise DatasetError(f"unknown environment {d.env_id!r}, known: {', '.join(rise_envs.ENVS)}")
-    env = env_class(d.env_id)(**d.card.get("env_kwargs", {}))
-    total, episodes = len(d.actions), len(d.seeds)
+    claimed, here = d.card.get("params"), params_of(d.env_id)
+    if claimed is not None and claimed != here:
+        raise DatasetError(f"was recorded in {d.env_id} with {claimed}, here it has {here}")
+    _check_episodes(d)
+    env = env_class(d.env_id)()
     try:
-        if d.offsets[0] != 0 or d.offsets[-1] != total or (np.diff(d.offsets) < 1).any():
-            raise DatasetError("offsets do not cut the transitions into episodes")
-        if len(d.offsets) != episodes + 1 or len(d.expert) != episodes:
-            raise DatasetError("offsets, seeds and expert differ in their number of episodes")
         for key in OBSERVATIONS:
             space = env.observation_space[key]
-            _check_rows(f"observations.{key}", d.observations[key], total, space)
-            _check_rows(f"final.{key}", d.final[key], episodes, space)
-        _check_rows("actions", d.actions, total, env.action_space)
-        if d.rewards.shape != (total,) or not np.isfinite(d.rewards).all():
-            raise DatasetError("rewards are not one finite number for each transition")
+            _check_rows(f"observations.{key}", d.observations[key], len(d.actions), space)
+            _check_rows(f"final.{key}", d.final[key], len(d), space)
+        _check_rows("actions", d.actions, len(d.actions), env.action_space)
         last = env.compute_terminated(
-            d.final["achieved_goal"], d.final["desired_goal"], [{"cost": 0.0}] * episodes
+            d.final["achieved_goal"], d.final["desired_goal"], [{"cost": 0.0}] * len(d)
         )
         if not np.all(last):
             raise DatasetError(f"episode {np.argmin(last)} does not end at its goal")
-        if ((d.expert < 0) | (d.expert >= len(d.card.get("experts", range(1 << 30))))).any():
-            raise DatasetError("expert holds a number that no expert on the card has")
-        if d.costs.shape != (total,) or (d.costs != 0).any():
-            raise DatasetError("costs are not zero throughout: an episode is not safe")
     finally:
         env.close()
+
+
+def _check_episodes(d: Demonstrations) -> None:
+    """How transitions make up episodes, and what holds of each."""
+    total, episodes = len(d.actions), len(d.seeds)
+    for name, kind in NUMBERS.items():
+        if getattr(d, name).dtype != kind:
+            raise DatasetError(f"{name} are {getattr(d, name).dtype}, not {np.dtype(kind)}")
+    if not episodes or d.offsets.shape != (episodes + 1,) or d.expert.shape != (episodes,):
+        raise DatasetError("offsets, seeds and expert differ in their number of episodes, or there is none")
+    if d.offsets[0] != 0 or d.offsets[-1] != total or (np.diff(d.offsets) < 1).any():
+        raise DatasetError("offsets do not cut the transitions into episodes")
+    if d.rewards.shape != (total,) or not np.isfinite(d.rewards).all():
+        raise DatasetError("rewards are not one finite number for each transition")
+    if d.costs.shape != (total,) or (d.costs != 0).any():
+        raise DatasetError("costs are not zero throughout: an episode is not safe")
+    if ((d.expert < 0) | (d.expert >= len(d.card.get("experts", range(1 << 30))))).any():
+        raise DatasetError("expert holds a number that no expert on the card has")
 
 
 def _check_rows(name: str, array: NDArray, rows: int, space: Any) -> None:

@@ -10,7 +10,6 @@ from gymnasium import spaces
 
 from rise_agents.demonstrations.dataset import (
     OBSERVATIONS,
-    SCHEMA,
     DatasetError,
     Demonstrations,
     from_arrays,
@@ -41,7 +40,7 @@ def export(d: Demonstrations, dataset_id: str) -> None:
     import minari
     from minari.data_collector import EpisodeBuffer
 
-    env = env_class(d.env_id)(**d.card.get("env_kwargs", {}))
+    env = env_class(d.env_id)()
     action_space = spaces.Box(
         env.action_space.low.astype(np.float64), env.action_space.high.astype(np.float64), dtype=np.float64
     )
@@ -128,10 +127,8 @@ def load(dataset_id: str, env_id: str) -> Demonstrations:
         arrays[f"observations.{key}"] = np.concatenate([e.observations[key][:-1] for e in episodes])
         arrays[f"final.{key}"] = np.stack([e.observations[key][-1] for e in episodes])
     card = {
-        "schema": SCHEMA,
         "source": f"minari:{dataset_id}",
         "episodes": len(episodes),
         "transitions": sum(lengths),
-        "env_kwargs": {},
     }
     return from_arrays(env_id, arrays, card)

@@ -2,28 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import is_dataclass
-from typing import Any
+from collections.abc import Callable, Iterator
+from contextlib import nullcontext
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rise_agents.agent import config_to_dict
+from rise_agents import archive
+from rise_agents.agent import Progress, silent
 from rise_agents.checkpoint import versions
-from rise_agents.demonstrations.dataset import OBSERVATIONS, Demonstrations
+from rise_agents.demonstrations.dataset import OBSERVATIONS, DatasetError, Demonstrations, params_of
 from rise_agents.experts import make_expert
+from rise_agents.pool import Pool, TaskError
 from rise_agents.rollout import Transitions, policy_keys, rollout
 from rise_agents.seeds import PER_RUN, episode_seeds
-from rise_agents.workers import make_pool, stop
-from rise_envs.task import env_class
 
-CHUNK = 50  # candidate episodes per job, at most
+CHUNK = 50  # candidate episodes per piece of work, at most
+KIND = "candidates"
 
 
-def _candidates(
-    env_id: str, expert: str, seed: int, start: int, count: int
-) -> tuple[Transitions, Any, Any, Any]:
+class Part(NamedTuple):
+    """Candidate episodes that follow one another: E episodes, T transitions."""
+
+    transitions: Transitions
+    reached: NDArray[np.bool_]  # (E,)
+    seeds: NDArray[np.int64]  # (E,)
+    expert: NDArray[np.int64]  # (E,)
+
+
+def _candidates(env_id: str, expert: str, seed: int, start: int, count: int) -> Part:
     """Roll out candidate episodes; returns them with what is needed to choose and describe them."""
     policy = make_expert(expert, env_id, seed=seed)
     seeds = episode_seeds("train", seed, start, count)
@@ -31,7 +41,51 @@ def _candidates(
     choose = getattr(policy, "choose", None)
     chosen = choose(policy_keys(seeds)) if choose else np.zeros(count, np.int64)
     assert transitions is not None  # noqa: S101  record=True
-    return transitions, episodes.reached, seeds, np.asarray(chosen, np.int64)
+    return Part(transitions, episodes.reached, seeds, np.asarray(chosen, np.int64))
+
+
+def chunk_size(episodes: int) -> int:
+    """Candidates per piece of work where so many episodes are wanted."""
+    return min(CHUNK, max(10, episodes))
+
+
+def part_path(folder: Path, start: int) -> Path:
+    """Where the candidates from number ``start`` on are stored."""
+    return folder / f"{start:07d}.rise"
+
+
+def record_part(
+    output: Path, progress: Progress, env_id: str, expert: str, seed: int, start: int, count: int
+) -> None:
+    """Roll out ``count`` candidate episodes from number ``start`` on, and store them."""
+    part = _candidates(env_id, expert, seed, start, count)
+    arrays: dict[str, NDArray] = {"reached": part.reached, "seeds": part.seeds, "expert": part.expert}
+    for name, value in vars(part.transitions).items():
+        nested = value if isinstance(value, dict) else {"": value}
+        arrays |= {f"transitions.{name}.{key}": array for key, array in nested.items()}
+    archive.write(output, KIND, arrays, _facts(env_id, expert, seed, start, count))
+
+
+def _facts(env_id: str, expert: str, seed: int, start: int, count: int) -> dict[str, Any]:
+    return {"env": env_id, "expert": expert, "seed": seed, "start": start, "count": count}
+
+
+def _read_part(path: Path, facts: dict[str, Any]) -> Part:
+    try:
+        arrays, found = archive.read(path, KIND)
+        if found != facts:
+            raise archive.ArchiveError(f"holds {found}, not {facts}")
+    except archive.ArchiveError as error:
+        raise DatasetError(f"{path}: {error.reason}; remove it to record it again") from None
+    grouped: dict[str, Any] = {}
+    for key, array in arrays.items():
+        if key.startswith("transitions."):
+            _, name, inner = key.split(".")
+            if inner:
+                grouped.setdefault(name, {})[inner] = array
+            else:
+                grouped[name] = array
+    return Part(Transitions(**grouped), arrays["reached"], arrays["seeds"], arrays["expert"])
 
 
 def generate(
@@ -41,6 +95,7 @@ def generate(
     seed: int = 0,
     workers: int = 1,
     finished: Callable[[int, int], None] = lambda kept, tried: None,
+    parts: Path | None = None,
 ) -> Demonstrations:
     """The first ``episodes`` safe and successful episodes of an expert, in the order of their seeds.
 
@@ -51,66 +106,72 @@ def generate(
         seed: which range of training seeds to use.
         workers: processes; the result is the same for any number.
         finished: told how many episodes were kept and tried so far.
+        parts: a folder for pieces of the work. Those that lie there are not done again, so that a recording that was
+            interrupted goes on where it was.
 
     Raises:
         ValueError: an unknown expert, or one that fails so often that the seeds run out.
+        DatasetError: a piece in ``parts`` is damaged or of another recording.
+        TaskError: a worker process died.
     """
     make_expert(expert, env_id, seed=seed)  # an unknown name is told here, not in a worker
-    parts: list[tuple[Transitions, Any, Any, Any]] = []
+    done: list[Part] = []
     kept = tried = 0
-    for part in _ordered(env_id, expert, episodes, seed, workers):
-        parts.append(part)
-        kept, tried = kept + int(part[1].sum()), tried + len(part[1])
-        finished(min(kept, episodes), tried)
-        if kept >= episodes:
-            break
-        if tried >= 20 * CHUNK and kept < 0.05 * tried:
-            raise ValueError(
-                f"expert {expert!r} succeeds in {kept} of {tried} episodes of {env_id}: no use going on"
-            )
-    return _assemble(env_id, expert, episodes, seed, parts)
+    with nullcontext(parts) if parts else TemporaryDirectory() as folder:
+        for part in _ordered(env_id, expert, episodes, seed, workers, Path(folder)):
+            done.append(part)
+            kept, tried = kept + int(part.reached.sum()), tried + len(part.reached)
+            finished(min(kept, episodes), tried)
+            if kept >= episodes:
+                break
+            if tried >= 20 * CHUNK and kept < 0.05 * tried:
+                raise ValueError(
+                    f"expert {expert!r} succeeds in {kept} of {tried} episodes of {env_id}: no use going on"
+                )
+    return _assemble(env_id, expert, episodes, seed, done)
 
 
-def _ordered(env_id: str, expert: str, episodes: int, seed: int, workers: int) -> Any:
-    """Chunks of candidates in order, computed by ``workers`` processes a little ahead of need."""
-    chunk = min(CHUNK, max(10, episodes))
-    if workers <= 1 or episodes <= chunk:
-        for start in range(0, PER_RUN, chunk):
-            yield _candidates(env_id, expert, seed, start, chunk)
-        return
-    with make_pool(workers) as pool:
-        try:
-            queue: list[Any] = [
-                pool.submit(_candidates, env_id, expert, seed, i * chunk, chunk)
-                for i in range(max(workers, -(-episodes // chunk)))
-            ]
-            for number in range(PER_RUN // chunk):
-                if number >= len(queue):
-                    queue.append(pool.submit(_candidates, env_id, expert, seed, number * chunk, chunk))
-                yield queue[number].result()
-                queue[number] = None  # frees the arrays
-        finally:  # enough episodes, or interrupted: what is still running is not needed
-            stop(pool)
+def _ordered(
+    env_id: str, expert: str, episodes: int, seed: int, workers: int, folder: Path
+) -> Iterator[Part]:
+    """Parts in order; those that ``folder`` lacks are recorded by ``workers`` processes, a little ahead of need."""
+    count = chunk_size(episodes)
+    needed, begun = -(-episodes // count), 0
+    alone = workers <= 1 or needed == 1
+    with Pool(workers) as pool:  # starts nothing before it is given something
+        for number in range(PER_RUN // count):
+            path = part_path(folder, number * count)
+            if alone and not path.exists():
+                record_part(path, silent, env_id, expert, seed, number * count, count)
+            while not path.exists():
+                while pool.free and begun < max(needed, number + 1):
+                    start = begun * count
+                    if not part_path(folder, start).exists():
+                        pool.start(
+                            begun, _record, part_path(folder, start), env_id, expert, seed, start, count
+                        )
+                    begun += 1
+                for ended in pool.wait():
+                    if ended.error or ended.died:
+                        reason = ended.error or f"its worker process ended with {ended.died}"
+                        raise TaskError(f"recording from episode {ended.key * count} on: {reason}")
+            yield _read_part(path, _facts(env_id, expert, seed, number * count, count))
 
 
-def _params(env_id: str) -> dict[str, Any]:
-    """The constants of the environment, where it publishes them."""
-    env = env_class(env_id)()
-    env.close()
-    params = getattr(env, "params", None)
-    return config_to_dict(params) if is_dataclass(params) else {}
+def _record(tell: Progress, output: Path, *arguments: Any) -> None:
+    record_part(output, tell, *arguments)
 
 
-def _assemble(env_id: str, expert: str, episodes: int, seed: int, parts: list) -> Demonstrations:
+def _assemble(env_id: str, expert: str, episodes: int, seed: int, parts: list[Part]) -> Demonstrations:
     """The first ``episodes`` good episodes of ordered chunks."""
-    good = np.concatenate([reached for _, reached, _, _ in parts])
+    good = np.concatenate([part.reached for part in parts])
     needed = np.flatnonzero(good)[:episodes]
     tried = int(needed[-1]) + 1
-    lengths = np.concatenate([np.diff(t.offsets) for t, _, _, _ in parts])
+    lengths = np.concatenate([np.diff(part.transitions.offsets) for part in parts])
     keep = np.zeros(len(good), bool)
     keep[needed] = True
     rows = np.repeat(keep, lengths)
-    chunks = [t for t, _, _, _ in parts]
+    chunks = [part.transitions for part in parts]
 
     def flat(name: str) -> NDArray:
         return np.concatenate([getattr(t, name) for t in chunks])[rows]
@@ -123,8 +184,7 @@ def _assemble(env_id: str, expert: str, episodes: int, seed: int, parts: list) -
         "experts": list(getattr(policy, "names", (expert,))),
         "seed": seed,
         "split": "train",
-        "env_kwargs": {},
-        "params": _params(env_id),
+        "params": params_of(env_id),
         "episodes": len(needed),
         "transitions": int(rows.sum()),
         "tried": tried,
@@ -139,7 +199,7 @@ def _assemble(env_id: str, expert: str, episodes: int, seed: int, parts: list) -
         flat("costs"),
         final,
         np.concatenate(([0], np.cumsum(lengths[keep]))).astype(np.int64),
-        np.concatenate([s for _, _, s, _ in parts])[keep],
-        np.concatenate([e for _, _, _, e in parts])[keep],
+        np.concatenate([part.seeds for part in parts])[keep],
+        np.concatenate([part.expert for part in parts])[keep],
         card,
     )
