@@ -62,7 +62,7 @@ def wrong_setting(rng: np.random.Generator, sample: Sample) -> bytes:
         name = str(rng.choice([key for key, value in config.items() if isinstance(value, list)]))
         config[name] = [*config[name], 7]
     elif kind == 2:
-        wrong = [None, [], "x", 3, [["updates", 3]], {"": {}}]
+        wrong: list[Any] = [None, [], "x", 3, [["updates", 3]], {"": {}}]
         return hostile.redescribed(sample, config=wrong[int(rng.integers(len(wrong)))])
     else:
         settings = fields(agent_class(description["agent"]).Config)
@@ -107,7 +107,9 @@ FORGERS: dict[str, Forger] = {
     "pickle bomb": lambda rng, sample, other, marks: hostile.bombs(rng, marks, sample, "config"),
     "signed, header": _signed(hostile.headers),
     "signed, arrays": _signed(hostile.arrays_changed),
-    "signed, arrays of another": lambda rng, sample, other, marks: hostile.archive(other.arrays, sample.header),
+    "signed, arrays of another": lambda rng, sample, other, marks: hostile.archive(
+        other.arrays, sample.header
+    ),
     "signed, setting": _signed(wrong_setting),
     "signed, environment": _signed(wrong_env),
     "signed, agent": _signed(wrong_agent),

@@ -92,7 +92,9 @@ FORGERS: dict[str, Forger] = {
     "pickle bomb": lambda rng, sample, other, marks: hostile.bombs(rng, marks, sample, "env"),
     "signed, header": _signed(hostile.headers),
     "signed, arrays": _signed(hostile.arrays_changed),
-    "signed, arrays of another": lambda rng, sample, other, marks: hostile.archive(other.arrays, sample.header),
+    "signed, arrays of another": lambda rng, sample, other, marks: hostile.archive(
+        other.arrays, sample.header
+    ),
     "signed, environment": _signed(wrong_env),
     "signed, env_kwargs": _signed(wrong_kwargs),
     "signed, card": _signed(wrong_card),
@@ -162,7 +164,7 @@ def minari_store(place: Path) -> Iterator[Path]:
 
 def evil_spec(rng: np.random.Generator, data: Path) -> bool:
     """The stored environment is one that leaves a mark when it is imported; returns whether it may be loaded."""
-    spec = {"id": f"{hostile.EVIL}:Env-v0" if rng.random() < 0.5 else _ENVS[0]}
+    spec: dict[str, Any] = {"id": f"{hostile.EVIL}:Env-v0" if rng.random() < 0.5 else _ENVS[0]}
     spec |= {"entry_point": f"{hostile.EVIL}:Env", "reward_threshold": None, "nondeterministic": False}
     spec |= {"max_episode_steps": 200, "order_enforce": True, "disable_env_checker": False, "kwargs": {}}
     spec |= {"additional_wrappers": [], "vector_entry_point": f"{hostile.EVIL}:Env"}

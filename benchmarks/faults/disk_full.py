@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import functools
 import json
 import resource
 import shutil
@@ -52,9 +53,14 @@ def write_part(path: Path, version: int) -> None:
 
 def write_demonstrations(path: Path, version: int) -> None:
     """Four episodes of an expert."""
+    _demonstrations(version).save(path)
+
+
+@functools.cache
+def _demonstrations(version: int) -> Any:
     from rise_agents.demonstrations import generate
 
-    generate(ENV, "cbf", 4, seed=version).save(path)
+    return generate(ENV, "cbf", 4, seed=version)
 
 
 WRITERS: dict[str, Writer] = {
@@ -189,7 +195,11 @@ def ask(request: dict[str, Any]) -> list[list[Fault]]:
     Raises:
         Unavailable: this machine lets nobody mount one.
     """
-    command = [sys.executable, "-c", "import sys; from benchmarks.faults.disk_full import main; main(sys.argv[1])"]
+    command = [
+        sys.executable,
+        "-c",
+        "import sys; from benchmarks.faults.disk_full import main; main(sys.argv[1])",
+    ]
     if request["disk"] == "tmpfs":
         if not may_mount():
             raise Unavailable("no user namespaces with a tmpfs here")
@@ -227,7 +237,9 @@ def run(effort: Effort, tell: Tell) -> Findings:
                 results = ask({**request, "shares": chosen}) if chosen else []
             first = number if effort.only is None else effort.only
             for place_in_row, faults in enumerate(results):
-                findings.add(first + place_in_row, [Fault(f.kind, f"{kind}, {disk}: {f.details}") for f in faults])
+                findings.add(
+                    first + place_in_row, [Fault(f.kind, f"{kind}, {disk}: {f.details}") for f in faults]
+                )
             number += count
             tell(0.5 * number / (len(disks) * len(WRITERS) * count), {"faults": len(findings.faults)})
     if "tmpfs" in disks:
@@ -245,7 +257,7 @@ def _try_benchmark(effort: Effort, tell: Tell, findings: Findings, number: int) 
         made = kill_run.reference(kept)
         for name, content in made.results.items():
             (kept / name).write_bytes(content)
-        request = {"kind": "benchmark", "disk": "tmpfs", "files": sorted(made.files)}
+        request: dict[str, Any] = {"kind": "benchmark", "disk": "tmpfs", "files": sorted(made.files)}
         request |= {"needed": space_needed(kept / "warm")}
         request |= {"results": {name: str(kept / name) for name in made.results}}
         for which, share in chosen:

@@ -74,9 +74,7 @@ class Marks:
 
     def __init__(self, folder: Path) -> None:
         self.mark = folder / "mark"
-        (folder / f"{EVIL}.py").write_text(
-            f"open({str(self.mark)!r}, 'w').close()\nEnv = Agent = object\n"
-        )
+        (folder / f"{EVIL}.py").write_text(f"open({str(self.mark)!r}, 'w').close()\nEnv = Agent = object\n")
         self.folder = folder
 
     def __enter__(self) -> Marks:
@@ -112,7 +110,7 @@ def time_limit(seconds: float) -> Iterator[None]:
     """Raise ``TimeoutError`` in this block after some seconds (in the main thread, where there are alarms)."""
 
     def ring(*_: Any) -> None:
-        raise _Hang
+        raise Hang
 
     before = signal.signal(signal.SIGALRM, ring)
     signal.setitimer(signal.ITIMER_REAL, seconds)
@@ -123,7 +121,7 @@ def time_limit(seconds: float) -> Iterator[None]:
         signal.signal(signal.SIGALRM, before)
 
 
-class _Hang(BaseException):
+class Hang(BaseException):
     """It takes too long; no ``Exception``, so that nobody catches it on the way."""
 
 
@@ -137,7 +135,7 @@ def judge(load: Callable[[], Any], error: type[Exception], marks: Marks) -> list
     except error as refusal:
         if "\n" in str(refusal):
             faults.append(("error of several lines", repr(str(refusal))[:200]))
-    except _Hang:
+    except Hang:
         faults.append(("hang", f"more than {PATIENCE:g} s"))
     except BaseException as other:
         faults.append(("other exception", f"{type(other).__name__}: {str(other)[:200]}"))

@@ -77,7 +77,9 @@ def changed(before: Seen, after: Seen) -> list[Fault]:
     ]
 
 
-def disturb(process: subprocess.Popen[bytes], target: str, delay: float, choice: float) -> tuple[str, list[Fault]]:
+def disturb(
+    process: subprocess.Popen[bytes], target: str, delay: float, choice: float
+) -> tuple[str, list[Fault]]:
     """Let a run go on for ``delay`` seconds, then kill.
 
     Args:
@@ -104,7 +106,9 @@ def disturb(process: subprocess.Popen[bytes], target: str, delay: float, choice:
     process.wait()
     left = processes.orphans(process.pid)
     processes.end(process.pid)
-    faults = [Fault("orphan", f"{len(left)} processes {processes.PATIENCE:g} s after the {target} was killed")]
+    faults = [
+        Fault("orphan", f"{len(left)} processes {processes.PATIENCE:g} s after the {target} was killed")
+    ]
     return "group" if target == "group" else "parent", faults if left else []
 
 

@@ -17,7 +17,10 @@ def start(command: Sequence[str], log: Path | None = None) -> subprocess.Popen[b
     """Start a Python command line in a session of its own."""
     if log is None:
         return subprocess.Popen(  # noqa: S603
-            [sys.executable, *command], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, start_new_session=True
+            [sys.executable, *command],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
         )
     with log.open("ab") as sink:
         return subprocess.Popen(  # noqa: S603

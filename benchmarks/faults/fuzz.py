@@ -1,0 +1,370 @@
+"""Command lines and settings that make no sense: one line that says so, exit code 2, at once."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import io
+import json
+import subprocess
+import sys
+import time
+from argparse import Action
+from collections.abc import Callable, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from benchmarks.faults import hostile
+from benchmarks.faults.checkpoints import wrong_values
+from benchmarks.faults.measure import Effort, Fault, Findings, Tell
+from benchmarks.faults.training import BENCHMARKED
+from rise_agents import AGENTS, agent_class, make_agent
+
+LIMIT = 1.0  # s
+_CONFIGS = (3, 6, 9)  # last digits of the trials that are settings
+_REAL = 100  # one command line in so many is given to a process of its own
+_PATIENCE = 30.0  # s
+NAMES = ("", " ", "x", "RISE", "expertt", "é" * 40, "名前", "\U0001f916", "a\nb", "\x00", "x" * 100_000, "-", "=",
+         "rise;ls", "$(ls)", "../..", "%s%n", "{0}", "[bold]x[/]", "None", "\udcff", "rise pcbc", "rise\r")  # fmt: skip
+NO_WHOLE = ("NaN", "inf", "-inf", "1e400", "1.5", "-1", "-9999999999", "", " ", "abc", "0x10", "1,000", "9" * 5_000,
+            "None", "1e3", "\x00", "1\n2", "--")  # fmt: skip
+NO_NUMBER = ("NaN", "inf", "-inf", "1e400", "-1", "-0.5", "", "abc", "1,5", "None", "0x1p3", "\x00", "--1")
+JSON = ("{}", '{"a": 1}', "NaN", "Infinity", "-Infinity", "1e400", "[[1]]", "[{}]", "[NaN]", "[null]",
+        "[" * 3_000, "9" * 5_000, '"' + "x" * 10_000 + '"', '{"a":' * 3_000)  # fmt: skip
+
+
+class Program(NamedTuple):
+    """A command line.
+
+    Attributes:
+        module: for ``python -m``.
+        valid: arguments with which it would start; the folder is added.
+        required: names of options that must be there.
+    """
+
+    module: str
+    valid: tuple[str, ...]
+    required: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Of the module that has ``parser`` and ``main``."""
+        return self.module if self.module == "benchmarks.run" else f"{self.module}.__main__"
+
+    def options(self) -> list[Action]:
+        """All options but ``--help``."""
+        return [a for a in importlib.import_module(self.name).parser()._actions if a.dest != "help"]
+
+    def main(self, argv: Sequence[str]) -> int:
+        """In this process."""
+        return importlib.import_module(self.name).main(argv)
+
+
+PROGRAMS = (
+    Program("benchmarks.run", ("--preset", "smoke")),
+    Program("benchmarks.speed", ("--quick", "--rows", "memory")),
+    Program("benchmarks.fidelity", ("--quick",)),
+    Program("benchmarks.faults", ("--quick", "--rows", "save-load")),
+    Program("rise_agents.demonstrations", ("--env", "RISE-GroundVehicle-v0"), ("--env", "--out")),
+)
+# option -> texts that it must refuse
+_TEXTS: dict[str, tuple[str, ...]] = {
+    "--agents": NAMES, "--envs": NAMES, "--env": NAMES, "--preset": NAMES, "--expert": NAMES, "--rows": NAMES,
+    "--noise-model": (*NAMES, "step+", "+step", "dropout:2", "dropout:x", "delay:-1", "step:1:2", "delay:nan"),
+    "--device": (*NAMES, "cuda:99", "cpu:-1", "meta:x"),
+    "--minari": ("", "x", "a/b", "a b/c-v0", "/", "../x-v0", "x-v", "x" * 300 + "-v0x", "\x00", "a\nb"),
+    "--noise-levels": NO_NUMBER,
+    "--share": (*NO_NUMBER, "0", "1.01"),
+}  # fmt: skip
+_WHOLE = ("--seeds", "--episodes", "--demos", "--workers", "--repeats", "--seed", "--only")
+_PATHS = ("--out", "--docs")
+
+Line = list[str]
+
+
+def pick(rng: np.random.Generator, things: Sequence[Any]) -> Any:
+    """One of some things, whatever they are."""
+    return things[int(rng.integers(len(things)))]
+
+
+def bad_path(rng: np.random.Generator, place: Path) -> str:
+    """A path at which nothing can be written or read."""
+    file = place / "file"
+    file.touch()
+    return pick(
+        rng,
+        (
+            f"{file}/x",
+            f"{file}/é\n/x",
+            "/proc/no/such",
+            f"{place}/{'x' * 300}",
+            f"{place}/\x00",
+            "/dev/null/x",
+        ),
+    )
+
+
+def unknown_option(rng: np.random.Generator, program: Program, place: Path) -> Line:
+    """The name of an option with a slip in it."""
+    known = [option for action in program.options() for option in action.option_strings]
+    while True:
+        name = list(pick(rng, known))
+        at = int(rng.integers(2, len(name)))
+        slip = pick(rng, ("drop", "double", "swap", "other"))
+        if slip == "drop":
+            del name[at]
+        elif slip == "double":
+            name.insert(at, name[at])
+        elif slip == "swap":
+            name[at - 1], name[at] = name[at], name[at - 1]
+        else:
+            name[at] = pick(rng, "xq_é7\n")
+        text = "".join(name)
+        if text not in (*known, "--", "--help", "--hel", "--h", "--he") and text.startswith("--"):
+            return [text, *pick(rng, ([], ["1"], ["x", "y"]))]
+
+
+def missing_value(rng: np.random.Generator, program: Program, place: Path) -> Line:
+    """An option at the end, without what it takes."""
+    takers = [a for a in program.options() if a.nargs != 0]
+    return [pick(rng, takers).option_strings[0]]
+
+
+def bad_value(rng: np.random.Generator, program: Program, place: Path) -> Line:
+    """An option with a value that it cannot have."""
+    option = pick(
+        rng, [a.option_strings[0] for a in program.options() if a.nargs != 0 and a.dest != "settings"]
+    )
+    if option in _PATHS:
+        return [option, bad_path(rng, place)]
+    if option in _WHOLE:
+        return [option, pick(rng, NO_WHOLE)]
+    return [option, pick(rng, _TEXTS[option])]
+
+
+def too_many(rng: np.random.Generator, program: Program, place: Path) -> Line:
+    """Words that belong to no option, or a value for a switch."""
+    switches = [a.option_strings[0] for a in program.options() if a.nargs == 0]
+    word = pick(rng, ("run", "é", "x" * 10_000, "RISE-GroundVehicle-v0", "0", "a\nb", "\U0001f916"))
+    return pick(rng, ([word], [pick(rng, switches), word] if switches else [word], ["--", word]))
+
+
+def bad_setting(rng: np.random.Generator, program: Program, place: Path) -> Line:
+    """``--set`` with an unknown agent or field, hostile JSON, or another form."""
+    agent = pick(rng, list(AGENTS))
+    settings = fields(agent_class(agent).Config)
+    field = pick(rng, settings)
+    kind = int(rng.integers(4))
+    if kind == 0:
+        forms = (
+            "",
+            "=",
+            ".",
+            "x",
+            "rise",
+            "rise.",
+            "rise=1",
+            ".beta=1",
+            "rise.beta",
+            "=1",
+            "rise.=1",
+            "é.é",
+            "\x00",
+        )
+        text = pick(rng, forms)
+    elif kind == 1:
+        name = pick(rng, ("ris", "", "expert", f"{agent}@", f"{agent}@nowhere", "random", "é", "a\nb", "@"))
+        text = f"{name if name != f'{agent}@' else agent + '@x'}.{field.name}=1"
+    elif kind == 2:
+        text = f"{agent}.{field.name}x={pick(rng, ('1', 'x', *JSON))}"
+    else:
+        wrong = [json.dumps(value) for value in wrong_values(field.default) if not isinstance(value, str)]
+        text = f"{agent}.{field.name}={pick(rng, [*wrong, *JSON])}"
+        if isinstance(field.default, str):
+            text = f"{agent}.{field.name}={pick(rng, wrong)}"
+    return ["--agents", agent, "--set", text]
+
+
+def conflict(rng: np.random.Generator, program: Program, place: Path) -> Line:
+    """Options that each make sense, but not together or not here."""
+    lines: dict[str, list[Line]] = {
+        "benchmarks.run": [
+            ["--agents", "rise", "--envs", "RISE-GroundVehicle-v0", "--expert", "pcbc"],
+            ["--agents", "cppo", "--set", "cppo.n_envs=3", "cppo.n_steps=5", "cppo.batch_size=7"],
+            ["--noise-levels", "1", "-1"],
+            ["--agents", "rise", "nobody"],
+        ],
+        "benchmarks.speed": [["--render"], ["--rows", "memory", "no-such"], ["--docs", str(place / "no.md")]],
+        "benchmarks.fidelity": [["--episodes", "2"], ["--docs", str(place / "no.md")]],
+        "benchmarks.faults": [
+            ["--quick", "--share", "0.5"],
+            ["--only", "3"],
+            ["--only", "3", "--rows", "fuzz", "replay"],
+            ["--rows", "fuzz", "--render"],
+            ["--docs", str(place / "no.md")],
+        ],
+        "rise_agents.demonstrations": [
+            ["--expert", "panda"],
+            ["--seed", "1000"],
+            ["--episodes", "99999999999"],
+            ["--minari", "no version"],
+        ],
+    }
+    return pick(rng, lines[program.module])
+
+
+KINDS: tuple[Callable[[np.random.Generator, Program, Path], Line], ...] = (
+    unknown_option, missing_value, bad_value, bad_value, too_many, conflict,
+)  # fmt: skip
+
+
+def command_line(rng: np.random.Generator, place: Path) -> tuple[Program, Line]:
+    """A program and arguments of which at least one is wrong, among others that are right."""
+    program = pick(rng, PROGRAMS)
+    kinds = (*KINDS, bad_setting, bad_setting) if program.module == "benchmarks.run" else KINDS
+    kind = pick(rng, kinds)
+    wrong = kind(rng, program, place)
+    # A valid one must not come after a wrong one of the same name and take its place.
+    valid = [] if kind is conflict else _without(program.valid, wrong)
+    if kind is conflict and "--env" in program.required:
+        valid = list(program.valid)
+    out = [] if "--out" in wrong else ["--out", str(place / "out")]
+    return program, [*valid, *out, *wrong]
+
+
+def _without(valid: Sequence[str], wrong: Line) -> Line:
+    """Valid arguments but those whose option is in ``wrong`` too."""
+    kept: Line = []
+    keep = True
+    for word in valid:
+        keep = word not in wrong if word.startswith("--") else keep
+        kept += [word] if keep else []
+    return kept
+
+
+def complaint(code: Any, output: str, errors: str, seconds: float | None) -> list[tuple[str, str]]:
+    """What is wrong with how a program answered."""
+    faults = []
+    lines = errors.splitlines()
+    if "Traceback" in errors:
+        faults.append(("traceback", lines[-1][:200]))
+    if code != 2:
+        faults.append(("wrong exit code", f"{code} {errors[-200:]!r}"))
+    if len(lines) != 1 and "Traceback" not in errors:
+        faults.append(("not one line", repr(errors[:300])))
+    if output:
+        faults.append(("output", repr(output[:100])))
+    if seconds is not None and seconds > LIMIT:
+        faults.append(("slow", f"{seconds:.2f} s"))
+    return faults
+
+
+def in_process(program: Program, argv: Line) -> list[tuple[str, str]]:
+    """Give the arguments to ``main`` in this process."""
+    output, errors = io.StringIO(), io.StringIO()
+    started = time.perf_counter()
+    try:
+        with contextlib.redirect_stdout(output), contextlib.redirect_stderr(errors):
+            with hostile.time_limit(hostile.PATIENCE):
+                code = program.main(argv)
+    except hostile.Hang:
+        return [("started", f"more than {hostile.PATIENCE:g} s")]
+    except BaseException as error:
+        return [("traceback", f"{type(error).__name__}: {str(error)[:200]}")]
+    return complaint(code, output.getvalue(), errors.getvalue(), time.perf_counter() - started)
+
+
+def real_process(program: Program, argv: Line) -> tuple[list[tuple[str, str]], float]:
+    """Give the arguments to a process; also says how long it took."""
+    if any("\x00" in word for word in argv):  # no process can be given one
+        return [], 0.0
+    started = time.perf_counter()
+    try:
+        done = subprocess.run(  # noqa: S603
+            [sys.executable, "-m", program.module, *argv], capture_output=True, timeout=_PATIENCE
+        )
+    except subprocess.TimeoutExpired:
+        return [("started", f"more than {_PATIENCE:g} s")], _PATIENCE
+    except OSError:  # longer than the system takes
+        return [], 0.0
+    seconds = time.perf_counter() - started
+    output, errors = (text.decode(errors="backslashreplace") for text in (done.stdout, done.stderr))
+    return complaint(done.returncode, output, errors, seconds), seconds
+
+
+def shown(argv: Line) -> str:
+    """Arguments in a line, long ones cut."""
+    return " ".join(ascii(word) if len(word) < 80 else f"{word[:30]!a}…({len(word)})" for word in argv)
+
+
+def configuration(rng: np.random.Generator) -> list[Fault]:
+    """Any values for any settings of an agent: it is made, or ``ValueError`` in one line."""
+    name, env = pick(rng, list(AGENTS)), pick(rng, BENCHMARKED)
+    settings = fields(agent_class(name).Config)
+    values: dict[str, Any] = {}
+    for _ in range(int(rng.integers(1, 4))):
+        field = pick(rng, settings)
+        values[field.name] = pick(
+            rng, (*wrong_values(field.default), 0, -1, 10**30, 1e-300, 1, 0.5, "", [1, 2])
+        )
+    try:
+        with hostile.time_limit(hostile.PATIENCE):
+            make_agent(name, env, values)
+    except ValueError as error:
+        return [] if "\n" not in str(error) else [Fault("not one line", f"{name} {values}: {error!r}")]
+    except hostile.Hang:
+        return [Fault("hang", f"{name} {values}")]
+    except Exception as error:
+        return [Fault("other exception", f"{name} on {env}, {values}: {type(error).__name__}: {error}"[:300])]
+    return []
+
+
+def portion(numbers: list[int], effort: Effort) -> tuple[list[tuple[int, list[Fault]]], list[float]]:
+    """Some trials; also how long the processes among them took."""
+    found, seconds = [], []
+    with effort.scratch(f"from-{numbers[0]}") as place:
+        _warm_up(place)
+        for number in numbers:
+            rng = effort.rng(number)
+            if number % 10 in _CONFIGS:
+                found.append((number, configuration(rng)))
+                continue
+            program, argv = command_line(rng, place)
+            if number % _REAL == 0:
+                faults, took = real_process(program, argv)
+                seconds.append(took)
+            else:
+                faults = in_process(program, argv)
+            told = f"python -m {program.module} {shown(argv)}"
+            found.append((number, [Fault(kind, f"{why}: {told}") for kind, why in faults]))
+    return found, seconds
+
+
+def _warm_up(place: Path) -> None:
+    """Import what the programs import: its time counts for processes of their own only."""
+    for name in AGENTS:
+        agent_class(name)
+    for program in PROGRAMS:
+        in_process(program, [*program.valid, "--out", str(place / "out"), "--no-such-option"])
+    in_process(PROGRAMS[0], ["--set", "rise.no_such=1", "--out", str(place / "out")])
+
+
+def run(effort: Effort, tell: Tell) -> Findings:
+    """Command lines and settings in turn."""
+    findings = Findings()
+    numbers = list(effort.numbers(10_000, 10))
+    size = -(-len(numbers) // (4 * effort.workers))
+    tasks = [(numbers[i : i + size], effort) for i in range(0, len(numbers), size)]
+    seconds: list[float] = []
+    for done, (_, (found, took)) in enumerate(effort.each(portion, tasks)):
+        for number, faults in found:
+            findings.add(number, faults)
+        seconds += [each for each in took if each]
+        tell((done + 1) / len(tasks), {"faults": len(findings.faults)})
+    if seconds:
+        middle, most = np.median(seconds), max(seconds)
+        findings.note = f"{len(seconds)} in processes of their own: {middle:.2f} s, at most {most:.2f} s"
+    return findings
