@@ -112,8 +112,7 @@ class Plan:
             _known("agent", name, [*AGENTS, *REFERENCES])
         for env in self.envs:
             _known("environment", env, ENVS)
-            if any(name == "expert" or (name in AGENTS and imitates(name)) for name in self.agents):
-                _known("expert", self.expert, expert_names(env))
+        _known("expert", self.expert, sorted({name for env in ENVS for name in expert_names(env)}))
         _whole("episodes", self.episodes, 1, 1_000_000)
         _whole("demos", self.demos, 1, 500_000)
         _whole("seeds", self.seeds, 1, RUNS)
@@ -125,6 +124,13 @@ class Plan:
             agent, _, env = name.partition("@")
             _known("agent", agent, AGENTS)
             _known("environment", env or next(iter(ENVS)), ENVS)
+        for (
+            env
+        ) in self.envs:  # last: whether an agent imitates says its class, which takes a second to import
+            if self.expert in expert_names(env):
+                continue
+            if any(name == "expert" or (name in AGENTS and imitates(name)) for name in self.agents):
+                _known("expert", self.expert, expert_names(env))
 
     def config(self, agent: str, env: str) -> dict[str, Any]:
         """The settings of an agent in an environment that differ from its defaults."""

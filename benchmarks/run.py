@@ -113,7 +113,7 @@ def parse_settings(texts: Sequence[str]) -> dict[str, dict[str, Any]]:
             raise ValueError(f"--set takes AGENT.FIELD=VALUE, for instance rise.beta=0.1, got {text!r}")
         try:
             parsed = json.loads(value)
-        except ValueError:
+        except (ValueError, RecursionError):
             parsed = value
         settings.setdefault(agent, {})[field] = parsed
     return settings
@@ -121,9 +121,12 @@ def parse_settings(texts: Sequence[str]) -> dict[str, dict[str, Any]]:
 
 def plan_of(arguments: argparse.Namespace) -> Plan:
     """The plan that the arguments ask for, every setting checked before any work starts."""
-    from benchmarks.jobs import check_settings
     from rise_envs import ENVS, STAND_INS
 
+    if arguments.workers is not None and arguments.workers < 1:
+        raise ValueError(f"--workers must be at least 1, got {arguments.workers}")
+    if not arguments.checkpoint_every >= 0:
+        raise ValueError(f"--checkpoint-every must not be negative, got {arguments.checkpoint_every}")
     reported = [env for env in ENVS if env not in STAND_INS]
     plan = make_plan(
         arguments.preset,
@@ -137,11 +140,9 @@ def plan_of(arguments: argparse.Namespace) -> Plan:
         seeds=arguments.seeds,
         expert=arguments.expert,
     )
+    from benchmarks.jobs import check_settings  # only now: the agents import torch, which takes a second
+
     check_settings(plan)
-    if arguments.workers is not None and arguments.workers < 1:
-        raise ValueError(f"--workers must be at least 1, got {arguments.workers}")
-    if not arguments.checkpoint_every >= 0:
-        raise ValueError(f"--checkpoint-every must not be negative, got {arguments.checkpoint_every}")
     _check_device(arguments.device)
     return plan
 

@@ -40,4 +40,4 @@ def prepare_folder(out: Path) -> None:
         probe.touch()
         probe.unlink()
     except OSError as error:
-        raise ValueError(f"cannot write to the folder {out}: {error.strerror}") from None
+        raise ValueError(f"cannot write to the folder {str(out)!r}: {error.strerror}") from None

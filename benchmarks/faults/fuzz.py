@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 from argparse import Action
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -78,6 +78,7 @@ _TEXTS: dict[str, tuple[str, ...]] = {
     "--minari": ("", "x", "a/b", "a b/c-v0", "/", "../x-v0", "x-v", "x" * 300 + "-v0x", "\x00", "a\nb"),
     "--noise-levels": NO_NUMBER,
     "--share": (*NO_NUMBER, "0", "1.01"),
+    "--checkpoint-every": tuple(text for text in NO_NUMBER if text not in ("inf", "1e400")),
 }  # fmt: skip
 _WHOLE = ("--seeds", "--episodes", "--demos", "--workers", "--repeats", "--seed", "--only")
 _PATHS = ("--out", "--docs")
@@ -135,9 +136,8 @@ def missing_value(rng: np.random.Generator, program: Program, place: Path) -> Li
 
 def bad_value(rng: np.random.Generator, program: Program, place: Path) -> Line:
     """An option with a value that it cannot have."""
-    option = pick(
-        rng, [a.option_strings[0] for a in program.options() if a.nargs != 0 and a.dest != "settings"]
-    )
+    names = [a.option_strings[0] for a in program.options()]
+    option = pick(rng, [name for name in names if name in (*_PATHS, *_WHOLE, *_TEXTS)])
     if option in _PATHS:
         return [option, bad_path(rng, place)]
     if option in _WHOLE:
@@ -322,9 +322,9 @@ def configuration(rng: np.random.Generator) -> list[Fault]:
     return []
 
 
-def portion(numbers: list[int], effort: Effort) -> tuple[list[tuple[int, list[Fault]]], list[float]]:
-    """Some trials; also how long the processes among them took."""
-    found, seconds = [], []
+def portion(numbers: list[int], effort: Effort) -> list[tuple[int, list[Fault]]]:
+    """Some trials in this process."""
+    found = []
     with effort.scratch(f"from-{numbers[0]}") as place:
         _warm_up(place)
         for number in numbers:
@@ -333,14 +333,21 @@ def portion(numbers: list[int], effort: Effort) -> tuple[list[tuple[int, list[Fa
                 found.append((number, configuration(rng)))
                 continue
             program, argv = command_line(rng, place)
-            if number % _REAL == 0:
-                faults, took = real_process(program, argv)
-                seconds.append(took)
-            else:
-                faults = in_process(program, argv)
-            told = f"python -m {program.module} {shown(argv)}"
-            found.append((number, [Fault(kind, f"{why}: {told}") for kind, why in faults]))
-    return found, seconds
+            found.append((number, _faults(in_process(program, argv), program, argv)))
+    return found
+
+
+def _faults(wrong: list[tuple[str, str]], program: Program, argv: Line) -> list[Fault]:
+    return [Fault(kind, f"{why}: python -m {program.module} {shown(argv)}") for kind, why in wrong]
+
+
+def in_processes(numbers: list[int], effort: Effort) -> Iterator[tuple[int, list[Fault], float]]:
+    """Some trials in a process each, one after the other; also says how long each took."""
+    with effort.scratch("processes") as place:
+        for number in numbers:
+            program, argv = command_line(effort.rng(number), place)
+            wrong, seconds = real_process(program, argv)
+            yield number, _faults(wrong, program, argv), seconds
 
 
 def _warm_up(place: Path) -> None:
@@ -349,6 +356,7 @@ def _warm_up(place: Path) -> None:
         agent_class(name)
     for program in PROGRAMS:
         in_process(program, [*program.valid, "--out", str(place / "out"), "--no-such-option"])
+        in_process(program, [*program.valid, "--out", str(place / "out"), "--docs", str(place / "no.md")])
     in_process(PROGRAMS[0], ["--set", "rise.no_such=1", "--out", str(place / "out")])
 
 
@@ -356,14 +364,19 @@ def run(effort: Effort, tell: Tell) -> Findings:
     """Command lines and settings in turn."""
     findings = Findings()
     numbers = list(effort.numbers(10_000, 10))
-    size = -(-len(numbers) // (4 * effort.workers))
-    tasks = [(numbers[i : i + size], effort) for i in range(0, len(numbers), size)]
-    seconds: list[float] = []
-    for done, (_, (found, took)) in enumerate(effort.each(portion, tasks)):
+    real = [number for number in numbers if number % _REAL == 0]
+    inside = [number for number in numbers if number % _REAL]
+    size = max(1, -(-len(inside) // (4 * effort.workers)))
+    tasks = [(inside[i : i + size], effort) for i in range(0, len(inside), size)]
+    for done, (_, found) in enumerate(effort.each(portion, tasks)):
         for number, faults in found:
             findings.add(number, faults)
-        seconds += [each for each in took if each]
-        tell((done + 1) / len(tasks), {"faults": len(findings.faults)})
+        tell(0.5 * (done + 1) / len(tasks), {"faults": len(findings.faults)})
+    seconds: list[float] = []
+    for number, faults, took in in_processes(real, effort):  # alone: their time counts
+        findings.add(number, faults)
+        seconds += [took] if took else []
+        tell(0.5 + 0.5 * len(seconds) / len(real), {"faults": len(findings.faults)})
     if seconds:
         middle, most = np.median(seconds), max(seconds)
         findings.note = f"{len(seconds)} in processes of their own: {middle:.2f} s, at most {most:.2f} s"

@@ -65,7 +65,7 @@ def checked(argv: Sequence[str] | None) -> argparse.Namespace:
     episode_seeds("train", a.seed, 0, a.episodes)  # raises where the seeds do not suffice
     if (a.out / demonstrations.DATA).exists():
         raise ValueError(f"{a.out} holds a demonstration set already: name another folder or remove it")
-    if a.minari:
+    if a.minari is not None:
         check_id(a.minari)
     prepare_folder(a.out)
     return a
@@ -96,7 +96,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             )
             made.save(a.out)
             shutil.rmtree(pieces)
-            if a.minari:
+            if a.minari is not None:
                 export(made, a.minari)
     except KeyboardInterrupt:
         print(

@@ -24,7 +24,10 @@ def check_id(dataset_id: str) -> None:
     from minari import list_local_datasets
     from minari.dataset.minari_dataset import parse_dataset_id
 
-    parse_dataset_id(dataset_id)
+    try:
+        parse_dataset_id(dataset_id)
+    except (TypeError, ValueError):  # TypeError: its pattern lets an id without a version pass
+        raise ValueError(f"malformed Minari id {dataset_id!r}: it must look like rise/vehicle-v0") from None
     if dataset_id in list_local_datasets():
         raise ValueError(f"the local Minari store holds {dataset_id!r} already: choose another version")
 
