@@ -6,6 +6,7 @@ import hashlib
 import importlib
 import io
 import json
+import os
 import pickle
 import signal
 import struct
@@ -74,7 +75,7 @@ class Marks:
 
     def __init__(self, folder: Path) -> None:
         self.mark = folder / "mark"
-        (folder / f"{EVIL}.py").write_text(f"open({str(self.mark)!r}, 'w').close()\nEnv = Agent = object\n")
+        (folder / f"{EVIL}.py").write_text(f"import os\nos.mkdir({str(self.mark)!r})\nEnv = Agent = object\n")
         self.folder = folder
 
     def __enter__(self) -> Marks:
@@ -88,7 +89,8 @@ class Marks:
     def left(self) -> bool:
         """Whether something was run since the last look."""
         seen = self.mark.exists() or EVIL in sys.modules
-        self.mark.unlink(missing_ok=True)
+        if self.mark.exists():
+            self.mark.rmdir()
         sys.modules.pop(EVIL, None)
         return seen
 
@@ -102,7 +104,7 @@ class _Bomb:
         self.mark = mark
 
     def __reduce__(self) -> Any:
-        return open, (self.mark, "w")
+        return os.mkdir, (self.mark,)
 
 
 @contextmanager
