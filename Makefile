@@ -5,11 +5,13 @@ BIN     = $(VENV)/bin
 STAMP   = $(VENV)/.installed
 ARGS   ?=
 
-.PHONY: bench speed test test-slow smoke lint format clean help
+.PHONY: bench speed faults coverage test test-slow smoke lint format clean help
 
 help:
 	@echo "make bench      install, then demonstrations, training, 1,000 noisy scenarios, tables, figures, videos"
 	@echo "make speed      speed against the peers, into docs/performance.md"
+	@echo "make faults     try to break the suite, into docs/reliability.md: hours"
+	@echo "make coverage   what the fast tests reach"
 	@echo "make test       install, then all fast tests"
 	@echo "make test-slow  the tests that take minutes"
 	@echo "make smoke      the whole benchmark in miniature"
@@ -30,6 +32,12 @@ smoke: $(STAMP)
 
 speed: $(STAMP)
 	$(BIN)/python -m benchmarks.speed --docs docs/performance.md --bench-times $(ARGS)
+
+faults: $(STAMP)
+	$(BIN)/python -m benchmarks.faults --docs docs/reliability.md $(ARGS)
+
+coverage: $(STAMP)
+	$(BIN)/python -m benchmarks.faults --rows coverage --out runs/coverage $(ARGS)
 
 test: $(STAMP)
 	$(BIN)/python -m pytest -n auto $(ARGS)
