@@ -45,8 +45,10 @@ def replacing(path: StrPath) -> Iterator[Path]:
             os.fsync(file.fileno())
         temporary.replace(path)
         _sync_folder(path.parent)
-    except BaseException:
+    except BaseException as error:
         temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.errno:  # of the name that the caller knows
+            raise OSError(error.errno, os.strerror(error.errno), str(path)) from None
         raise
     finally:
         lock.close()

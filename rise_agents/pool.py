@@ -10,6 +10,7 @@ import multiprocessing
 import os
 import signal
 import threading
+import traceback
 from collections.abc import Callable
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -35,12 +36,14 @@ class Ended:
         key: of the task.
         result: what its function returned.
         error: what it raised instead, in words.
+        trace: where.
         died: how its process ended instead: the name of the signal, or the exit code.
     """
 
     key: Any
     result: Any = None
     error: str = ""
+    trace: str = ""
     died: str = ""
 
 
@@ -123,7 +126,7 @@ class _Worker:
                     listener(key, *content)
                     continue
                 self.task = None
-                return Ended(key, **{kind: content})
+                return Ended(key, **content)
         except (EOFError, OSError):
             self.process.join(_ALIVE_EVERY)
             alive = self.process.is_alive()
@@ -163,10 +166,10 @@ def _serve(connection: Connection) -> None:
         except EOFError:
             return
         try:
-            answer = ("result", function(tell, *arguments))
+            answer = {"result": function(tell, *arguments)}
         except Exception as error:  # whatever it is, the worker lives on
-            answer = ("error", f"{type(error).__name__}: {error}")
-        connection.send(answer)
+            answer = {"error": f"{type(error).__name__}: {error}", "trace": traceback.format_exc()}
+        connection.send(("ended", answer))
 
 
 _watching = False

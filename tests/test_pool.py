@@ -53,7 +53,7 @@ def test_results_errors_deaths_and_what_tasks_tell():
         ended |= everything(pool, 2)
     assert (ended["a"].result, ended["d"].result) == (9, 16)
     assert ended["b"].died == "SIGKILL"
-    assert ended["c"].error == "KeyError: 'nothing here'"
+    assert ended["c"].error == "KeyError: 'nothing here'" and "_fail" in ended["c"].trace
     assert told == [("a", ("half", 3)), ("d", ("half", 4))]
 
 
@@ -140,7 +140,9 @@ def test_a_killed_worker_is_named_and_its_job_tried_again_up_to_a_limit(tmp_path
     }
     assert (tmp_path / "a").read_text() == (tmp_path / "d").read_text() == "done"
     assert sum("third time" in line and "SIGTERM" in line for line in said) == 2
-    assert sum("never" in line and "SIGKILL" in line for line in said) == ATTEMPTS - 1
+    assert (
+        sum("never: its" in line and "SIGKILL" in line and "attempt" in line for line in said) == ATTEMPTS - 1
+    )
     assert ("fine", 0.5) in seen and ("fine", 1.0) in seen
 
 
