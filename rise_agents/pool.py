@@ -21,6 +21,7 @@ from rise_agents.workers import limit_threads
 
 # Told the key of a task and whatever it had to tell.
 Listener = Callable[..., None]
+_HUSH = "ignore:resource_tracker"
 _ALIVE_EVERY = 1.0  # s between two looks at who is still alive
 
 
@@ -59,15 +60,17 @@ class Pool:
 
     def __enter__(self) -> Pool:
         limit_threads()
+        _hush_tracker()
         return self
 
     def __exit__(self, *exception: object) -> None:
         for worker in self._crew:
-            worker.process.terminate()
+            worker.connection.close()  # which sends the idle home
+            if worker.task is not None:
+                worker.process.terminate()
         for worker in self._crew:
             worker.process.join(5)
             worker.process.kill()
-            worker.connection.close()
 
     @property
     def busy(self) -> int:
@@ -140,6 +143,13 @@ def _how(exitcode: int) -> str:
     return signal.Signals(-exitcode).name if exitcode < 0 else f"exit code {exitcode}"
 
 
+def _hush_tracker() -> None:
+    """Python's resource tracker cleans up after killed processes, and is proud of it on stderr; it need not be."""
+    known = os.environ.get("PYTHONWARNINGS", "")
+    if _HUSH not in known:
+        os.environ["PYTHONWARNINGS"] = f"{known},{_HUSH}".strip(",")
+
+
 @contextmanager
 def _interrupts_blocked() -> Any:
     """Processes started in this block never see a Ctrl-C, which the terminal sends to all: their parent ends them."""
@@ -163,7 +173,7 @@ def _serve(connection: Connection) -> None:
     while True:
         try:
             function, arguments = connection.recv()
-        except EOFError:
+        except (EOFError, OSError):
             return
         try:
             answer = {"result": function(tell, *arguments)}
