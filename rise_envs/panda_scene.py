@@ -60,7 +60,7 @@ class Params:
         check_fields(type(self), vars(self))
         for name in ("goal_radius", "reach", "redraw_interval", "max_hand_speed"):
             require(getattr(self, name) > 0, f"{name} must be > 0", self)
-        for name in ("max_speed", "goal_gap", "max_offset", "start_clearance", "start_time", "hand_radius"):
+        for name in ("max_speed", "goal_gap", "max_offset", "start_time", "hand_radius"):
             require(getattr(self, name) >= 0, f"{name} must not be negative", self)
         require(min(self.noise_scale) >= 0, "noise_scale must not be negative", self)
         for name in ("radius", "placed"):
