@@ -428,7 +428,7 @@ def test_lists_tensors_and_single_precision_are_observations(policies: Any, scen
 
 
 def test_raw_observations_that_make_no_sense() -> None:
-    from tests.toy_envs import Walk
+    from toy_envs import Walk
 
     agent = make_agent("cppo", "ToyWalk-v0", {**BRIEF["cppo"], "frame": "raw", "batch_size": 64}).learn(
         Walk(dict_space=True)
