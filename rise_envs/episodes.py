@@ -78,7 +78,8 @@ def check_options(options: Any) -> None:
 def each_seed(seed: Seeds, count: int) -> Sequence[Any]:
     """A seed, or None, for each sub-environment; raises ``ValueError`` unless it is one, or ``count`` of them."""
     if isinstance(seed, int | np.integer) and not isinstance(seed, bool):
-        return range(int(seed), int(seed) + count)
+        first = streams.checked_seed(seed)
+        return range(first, first + count)
     if (
         isinstance(seed, str | bytes)
         or not isinstance(seed, Sequence | np.ndarray | None)
