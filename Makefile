@@ -5,7 +5,7 @@ BIN     = $(VENV)/bin
 STAMP   = $(VENV)/.installed
 ARGS   ?=
 
-.PHONY: bench speed faults coverage test test-slow smoke lint format clean help
+.PHONY: bench speed faults coverage test test-slow smoke lint audit format clean help
 
 help:
 	@echo "make bench      install, then demonstrations, training, 1,000 noisy scenarios, tables, figures, videos"
@@ -16,6 +16,7 @@ help:
 	@echo "make test-slow  the tests that take minutes"
 	@echo "make smoke      the whole benchmark in miniature"
 	@echo "make lint       ruff and mypy"
+	@echo "make audit      known vulnerabilities of what is installed (needs pypi.org)"
 	@echo "Extra arguments go through ARGS, for instance: make bench ARGS='--noise-model episode'"
 
 $(STAMP): pyproject.toml constraints.txt
@@ -49,6 +50,17 @@ lint: $(STAMP)
 	$(BIN)/python -m ruff check .
 	$(BIN)/python -m ruff format --check .
 	$(BIN)/python -m mypy
+
+# pip-audit has a venv of its own, so that it changes nothing of what it looks at. --strict: a package that the
+# database does not know is an error, else a machine that cannot reach it would find everything in order.
+# The package itself and local builds (torch's +cpu) are not on PyPI: the former is left out, the latter lose their mark.
+$(VENV)/audit/bin/pip-audit: $(STAMP)
+	$(PYTHON) -m venv $(VENV)/audit
+	$(VENV)/audit/bin/python -m pip install --quiet --disable-pip-version-check 'pip-audit>=2.7'
+
+audit: $(VENV)/audit/bin/pip-audit
+	$(BIN)/python -m pip freeze --exclude-editable | sed 's/+[a-z0-9.]*$$//' > $(VENV)/audit/installed.txt
+	$(VENV)/audit/bin/pip-audit --strict --no-deps --disable-pip -r $(VENV)/audit/installed.txt $(ARGS)
 
 format: $(STAMP)
 	$(BIN)/python -m ruff check --fix .

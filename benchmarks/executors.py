@@ -16,10 +16,11 @@ ATTEMPTS = 3  # that a job gets if its worker process dies, which may be no faul
 
 @dataclass(frozen=True)
 class Failure:
-    """A job that did not end well, and why."""
+    """A job that did not end well, and why; ``trace`` says where, for who looks for a defect."""
 
     job: Job
     reason: str
+    trace: str = ""
 
 
 def _work(tell: Callable[..., None], job: Job) -> None:
@@ -35,7 +36,7 @@ def run_jobs(
         jobs: in any order.
         workers: processes.
         watch: told of progress.
-        say: told, in one line, when a worker process has died.
+        say: told, in one line, when a worker process has died or a job has failed.
 
     Returns:
         What failed. A failure stops nothing but the jobs that depend on it.
@@ -90,5 +91,6 @@ class _Schedule:
         elif not reason and not job.output.exists():
             reason = f"it ended without writing {job.output}"
         if reason:
-            self.failures.append(Failure(job, reason))
+            self.failures.append(Failure(job, reason, ended.trace))
+            self.say(f"failed: {job.name}: {reason}")
         self.watch(job, 1.0, {})

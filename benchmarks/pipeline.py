@@ -61,6 +61,7 @@ def execute(plan: Plan, out: Path, how: How) -> list[Failure]:
         jobs += video_jobs(plan, out) if how.videos else []
         display.plan(jobs)
         failures = run_jobs(jobs, how.workers, display.watch, display.say)
+    _write_failures(out / "failures.log", failures)
     _write_run(plan, out, how, failures)
     _write_results(plan, out, evaluations, how.command)
     return failures
@@ -84,6 +85,15 @@ def _write_results(plan: Plan, out: Path, evaluations: list[Job], command: Seque
         print(report.summary_table_text(summary, env))
 
 
+def _write_failures(path: Path, failures: list[Failure]) -> None:
+    """What went wrong and where, for who looks for a defect; no file if nothing did."""
+    if failures:
+        texts = [f"{failure.job.name}: {failure.reason}\n{failure.trace}" for failure in failures]
+        results.atomic_write_text(path, "\n".join(texts))
+    else:
+        path.unlink(missing_ok=True)
+
+
 def _trained(plan: Plan, out: Path) -> dict[str, dict[str, Any]]:
     """How each agent was trained, in words and numbers, per agent and environment."""
     facts: dict[str, dict[str, Any]] = {}
@@ -105,7 +115,7 @@ def _write_run(plan: Plan, out: Path, how: How, failures: list[Failure]) -> None
     cards = {}
     for env in plan.envs:
         folder = demonstrations_folder(plan, env, out)
-        if (folder / demonstrations.DATA).exists():
+        if all((folder / name).exists() for name in (demonstrations.DATA, demonstrations.CARD)):
             cards[env] = json.loads((folder / demonstrations.CARD).read_text())
     run = {
         "command": shlex.join(how.command),

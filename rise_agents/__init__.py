@@ -11,6 +11,7 @@ import os
 from typing import Any
 
 from rise_agents.agent import Agent, nearest
+from rise_envs.streams import checked_seed
 
 __version__ = "0.1.0"
 
@@ -47,9 +48,9 @@ def make_agent(
         device: a torch device.
 
     Raises:
-        ValueError: an unknown agent or setting, or a setting out of range.
+        ValueError: an unknown agent or setting, a setting out of range, or a seed that is no whole number ≥ 0.
     """
-    return agent_class(name)(env_id, config or {}, seed, device)
+    return agent_class(name)(env_id, {} if config is None else config, checked_seed(seed), device)
 
 
 def load_agent(path: str | os.PathLike[str], env_id: str | None = None, device: str = "cpu") -> Agent:

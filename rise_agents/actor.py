@@ -37,7 +37,15 @@ class Actor:
             self.sigma = np.exp(arrays["policy.log_std"].astype(np.float64))
 
     def output(self, inputs: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Mean actions in units of the bounds, or logits, (B, A), for inputs (B, K)."""
+        """Mean actions in units of the bounds, or logits, (B, A), for inputs (B, K).
+
+        Raises:
+            ValueError: inputs of another width than those of training.
+        """
+        if inputs.shape[-1] != len(self.units.mean):
+            raise ValueError(
+                f"the policy reads {len(self.units.mean)} numbers, got {inputs.shape[-1]} an observation"
+            )
         x: NDArray = self.units(inputs).astype(np.float64)
         for weight, bias in self.layers[:-1]:
             x = np.tanh(x @ weight + bias)

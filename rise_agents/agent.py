@@ -8,16 +8,17 @@ state, so that what it does in an episode depends on the episode's key only, not
 
 from __future__ import annotations
 
-import difflib
 import os
-from collections.abc import Callable, Iterable
-from dataclasses import asdict, fields
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rise_envs import STAND_INS, streams
+from rise_envs.settings import as_settings
+from rise_envs.settings import nearest as nearest
 
 State = tuple[NDArray, ...] | None
 # Reports training progress: (share done in [0, 1], named figures of this moment).
@@ -93,34 +94,13 @@ def merge_states(old: State, new: State, rows: NDArray[np.bool_]) -> State:
     )
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
-    """A hint for an error line: the closest known name, and all of them."""
-    known = sorted(known)
-    close = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
-    hint = f"did you mean {close[0]!r}? " if close else ""
-    return f"{hint}known: {', '.join(known)}"
-
-
-def config_from_dict(kind: type, values: dict[str, Any]) -> Any:
+def config_from_dict(kind: type, values: Mapping[str, Any]) -> Any:
     """A validated config dataclass from a plain dict.
 
     Raises:
-        ValueError: an unknown key, with the nearest known one.
+        ValueError: an unknown key (the nearest known one is named), or a value of another kind than the field.
     """
-    known = {field.name: field.default for field in fields(kind)}
-    for key, value in values.items():
-        if key not in known:
-            raise ValueError(f"unknown setting {key!r}: {nearest(key, known)}")
-        _check_kind(key, value, known[key])
-    plain = {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
-    return kind(**plain)
-
-
-def _check_kind(key: str, value: Any, default: Any) -> None:
-    """Raise ``ValueError`` unless ``value`` is of the kind of the setting's default (None: of any kind)."""
-    kinds = {int: (int,), float: (int, float), str: (str,), tuple: (tuple, list)}.get(type(default))
-    if kinds and (not isinstance(value, kinds) or isinstance(value, bool)):
-        raise ValueError(f"{key} must be a {type(default).__name__} such as {default!r}, got {value!r}")
+    return as_settings(kind, values, "config")
 
 
 def make_config(kind: Any, env_id: str, values: dict[str, Any]) -> Any:
@@ -129,6 +109,8 @@ def make_config(kind: Any, env_id: str, values: dict[str, Any]) -> Any:
     What stands in for an environment has that environment's defaults.
     """
     preset = kind.PRESETS.get(STAND_INS.get(env_id, env_id), {})
+    if not isinstance(values, Mapping):
+        raise ValueError(f"config must be a dict of the agent's settings, got {values!r}")
     return config_from_dict(kind.Config, {**preset, **values})
 
 

@@ -17,7 +17,7 @@ import numpy as np
 import safetensors.numpy as st
 from numpy.typing import NDArray
 
-from rise_agents.files import StrPath, replace_file
+from rise_agents.files import StrPath, replace_file, sweep
 
 MAGIC = b"RISEfile"
 SCHEMA = 1
@@ -51,6 +51,7 @@ def write(path: StrPath, kind: str, arrays: Mapping[str, NDArray], description: 
     )
     # Not ascontiguousarray, which gives a single number an axis.
     body = st.save({name: np.asarray(a, order="C") for name, a in arrays.items()}, metadata={"rise": header})
+    sweep(Path(path).parent, Path(path).name)
     replace_file(path, MAGIC + hashlib.sha256(body).digest() + body)
 
 

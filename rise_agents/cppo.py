@@ -212,10 +212,13 @@ class CPPO:
         for key, part in parts.items():
             if not isinstance(part, spaces.Box):
                 raise ValueError(f"observation {key!r} must be a Box to be read as numbers, got {part}")
-        if self._task is not None:
-            given, known = parts["obstacle"].shape, (len(self._task.noise_scale),)
-            if given != known:
-                raise ValueError(f"observation 'obstacle' of {self.env_id!r} has shape {known}, got {given}")
+        for key, width in self._task.widths.items() if self._task is not None else ():
+            given = parts[key].shape if key in parts else None
+            if given != (width,):
+                hint = f"frame {self.config.frame!r} reads it, frame='raw' anything"
+                raise ValueError(
+                    f"observation {key!r} must be ({width},), the environment's is {given}: {hint}"
+                )
         return {key: len(part.shape or ()) for key, part in parts.items()}
 
     def _inputs(self, observation: Any) -> NDArray[np.float64]:
@@ -254,12 +257,10 @@ class CPPO:
         """
         if self._actor is None:
             raise RuntimeError("this C-PPO agent is untrained: call learn() or load a checkpoint first")
-        parts = observation if isinstance(observation, dict) else {"": observation}
-        parts = {key: np.asarray(readings.on_host(part)) for key, part in parts.items()}
-        single = all(np.ndim(parts[key]) == rank for key, rank in self._notes["ranks"].items())
-        if single:
-            parts = {key: part[None] for key, part in parts.items()}
-        readings.check_finite(parts)
+        if self._task is not None:
+            parts, single = readings.checked_batch(self._task, observation)
+        else:
+            parts, single = readings.checked_parts(observation, self._notes["ranks"])
         output = self._actor.output(self._inputs(parts))
         if not deterministic:
             keys, counter = draw_state(state, episode_start, len(output), self._rng)

@@ -7,6 +7,7 @@ never takes away what another process is still writing.
 
 from __future__ import annotations
 
+import glob
 import os
 import secrets
 from collections.abc import Iterator
@@ -45,8 +46,10 @@ def replacing(path: StrPath) -> Iterator[Path]:
             os.fsync(file.fileno())
         temporary.replace(path)
         _sync_folder(path.parent)
-    except BaseException:
+    except BaseException as error:
         temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.errno:  # of the name that the caller knows
+            raise OSError(error.errno, os.strerror(error.errno), str(path)) from None
         raise
     finally:
         lock.close()
@@ -58,11 +61,11 @@ def replace_file(path: StrPath, content: bytes) -> None:
         temporary.write_bytes(content)
 
 
-def sweep(folder: StrPath, name: str = "*") -> None:
-    """Remove what writers that were killed left in ``folder`` (of files called ``name``; all by default)."""
+def sweep(folder: StrPath, name: str | None = None) -> None:
+    """Remove what writers that were killed left in ``folder`` (of the file ``name``; by default of all)."""
     if fcntl is None:
         return
-    for stray in Path(folder).glob(f"{_MARK}*-{name}"):
+    for stray in Path(folder).glob(f"{_MARK}*" if name is None else f"{_MARK}*-{glob.escape(name)}"):
         try:
             with stray.open("rb") as file:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -18,7 +18,7 @@ from rise_agents.agent import Progress, State, make_config, silent
 from rise_agents.cloning import ActionUnits, CloningConfig, Eyes
 from rise_agents.files import StrPath
 from rise_agents.networks import mlp
-from rise_agents.readings import as_batch, check_finite
+from rise_agents.readings import checked_batch
 from rise_agents.resume import Resume
 from rise_agents.stages import to_arrays
 from rise_agents.training import Forward, fit, layers_of, standardised
@@ -93,8 +93,7 @@ class PCBC:
         """Actions (B, A) for a batch of observations, or (A,) for one; nothing is drawn."""
         if not self._arrays:
             raise cloning.untrained(self.name)
-        rows, single = as_batch(observation)
-        check_finite(rows)
+        rows, single = checked_batch(self.task, observation)
         action = self.units.clip(self._policy(*self._eyes.inputs(rows)))
         return (action[0] if single else action), None
 

@@ -10,6 +10,7 @@ import multiprocessing
 import os
 import signal
 import threading
+import traceback
 from collections.abc import Callable
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ from rise_agents.workers import limit_threads
 
 # Told the key of a task and whatever it had to tell.
 Listener = Callable[..., None]
+_HUSH = "ignore:resource_tracker"
 _ALIVE_EVERY = 1.0  # s between two looks at who is still alive
 
 
@@ -35,12 +37,14 @@ class Ended:
         key: of the task.
         result: what its function returned.
         error: what it raised instead, in words.
+        trace: where.
         died: how its process ended instead: the name of the signal, or the exit code.
     """
 
     key: Any
     result: Any = None
     error: str = ""
+    trace: str = ""
     died: str = ""
 
 
@@ -56,15 +60,17 @@ class Pool:
 
     def __enter__(self) -> Pool:
         limit_threads()
+        _hush_tracker()
         return self
 
     def __exit__(self, *exception: object) -> None:
         for worker in self._crew:
-            worker.process.terminate()
+            worker.connection.close()  # which sends the idle home
+            if worker.task is not None:
+                worker.process.terminate()
         for worker in self._crew:
             worker.process.join(5)
             worker.process.kill()
-            worker.connection.close()
 
     @property
     def busy(self) -> int:
@@ -123,7 +129,7 @@ class _Worker:
                     listener(key, *content)
                     continue
                 self.task = None
-                return Ended(key, **{kind: content})
+                return Ended(key, **content)
         except (EOFError, OSError):
             self.process.join(_ALIVE_EVERY)
             alive = self.process.is_alive()
@@ -135,6 +141,13 @@ class _Worker:
 
 def _how(exitcode: int) -> str:
     return signal.Signals(-exitcode).name if exitcode < 0 else f"exit code {exitcode}"
+
+
+def _hush_tracker() -> None:
+    """Python's resource tracker cleans up after killed processes, and is proud of it on stderr; it need not be."""
+    known = os.environ.get("PYTHONWARNINGS", "")
+    if _HUSH not in known:
+        os.environ["PYTHONWARNINGS"] = f"{known},{_HUSH}".strip(",")
 
 
 @contextmanager
@@ -160,13 +173,13 @@ def _serve(connection: Connection) -> None:
     while True:
         try:
             function, arguments = connection.recv()
-        except EOFError:
+        except (EOFError, OSError):
             return
         try:
-            answer = ("result", function(tell, *arguments))
+            answer = {"result": function(tell, *arguments)}
         except Exception as error:  # whatever it is, the worker lives on
-            answer = ("error", f"{type(error).__name__}: {error}")
-        connection.send(answer)
+            answer = {"error": f"{type(error).__name__}: {error}", "trace": traceback.format_exc()}
+        connection.send(("ended", answer))
 
 
 _watching = False

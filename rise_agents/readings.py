@@ -28,6 +28,7 @@ from rise_envs.task import Task
 
 Array = NDArray[np.float64]
 FRAMES = ("world", "body", "features")
+_FLOAT64 = np.dtype(np.float64)
 
 
 def as_batch(observation: Mapping[str, Any]) -> tuple[dict[str, Array], bool]:
@@ -45,13 +46,111 @@ def on_host(value: Any) -> Any:
     return value.cpu() if hasattr(value, "cpu") else value
 
 
+def checked_batch(task: Task, observation: Any) -> tuple[dict[str, Array], bool]:
+    """What a policy reads of an observation of ``task``, with a batch axis in front; whether it came as a single one.
+
+    This is the door of every ``predict``: an observation is a batch if its ``desired_goal`` has two dimensions,
+    and every part of it must then have as many rows. Keys that no policy reads are left out. The arrays may be the
+    caller's own: read them only.
+
+    Args:
+        task: says how many numbers each part has.
+        observation: parts (S,), (D,), (C,), or (B, S), (B, D), (B, C); tensors of torch will do.
+
+    Returns:
+        Parts (B, S), (B, D), (B, C), float64.
+
+    Raises:
+        ValueError: a part that is missing, of another shape, not of real numbers, or not finite; it is named.
+    """
+    rows: dict[str, Array] = {}
+    try:  # one observation as environments give it, which is nothing but looked at: a microsecond and a half
+        for key, shape in task.shapes.items():
+            part = observation[key]
+            if type(part) is not np.ndarray or part.dtype is not _FLOAT64 or part.shape != shape:
+                break
+            if not np.vdot(part, part) < np.inf:
+                break
+            rows[key] = part[None]
+        else:
+            return rows, True
+    except (KeyError, TypeError, IndexError):  # named below
+        pass
+    return _converted_batch(task, observation)
+
+
+def _converted_batch(task: Task, observation: Any) -> tuple[dict[str, Array], bool]:
+    """`checked_batch` of whatever was given."""
+    parts = _parts(observation, task.widths)
+    rows = {key: _numbers(key, parts[key]) for key in task.widths}
+    lead = rows["desired_goal"].shape[:-1]
+    for key, width in task.widths.items():
+        if len(lead) > 1 or rows[key].shape != (*lead, width):
+            wanted = f"({width},), or (B, {width}) with the same B in every part"
+            raise ValueError(f"observation[{key!r}] must have shape {wanted}, got {rows[key].shape}")
+    check_finite(rows)
+    return ({key: value[None] for key, value in rows.items()}, True) if not lead else (rows, False)
+
+
+def checked_parts(observation: Any, ranks: Mapping[str, int]) -> tuple[dict[str, NDArray], bool]:
+    """As `checked_batch`, for any environment, of which the ranks of the parts of an observation are known.
+
+    Args:
+        observation: a dict of parts, or the only part, whose key is empty then.
+        ranks: number of dimensions of each part of a single observation.
+
+    Raises:
+        ValueError: as for `checked_batch`.
+    """
+    parts = {"": observation} if list(ranks) == [""] else _parts(observation, ranks)
+    rows = {key: _numbers(key, parts[key]) for key in ranks}
+    single = all(rows[key].ndim == rank for key, rank in ranks.items())
+    if single:
+        rows = {key: part[None] for key, part in rows.items()}
+    count = None
+    for key, rank in ranks.items():
+        count = rows[key].shape[:1] if count is None else count
+        if rows[key].ndim != rank + 1 or rows[key].shape[:1] != count:
+            wanted = f"{rank} dimensions, or one more with the same length in every part"
+            raise ValueError(f"{_place(key)} must have {wanted}, got shape {np.shape(parts[key])}")
+    check_finite(rows)
+    return rows, single
+
+
+def _parts(observation: Any, keys: Mapping[str, int]) -> Mapping[str, Any]:
+    """The observation itself; raises ``ValueError`` unless it is a dict with the given keys."""
+    if not isinstance(observation, Mapping):
+        raise ValueError(f"an observation must be a dict with the keys {list(keys)}, got {observation!r}")
+    for key in keys:
+        if key not in observation:
+            raise ValueError(f"observation lacks {key!r}, it has {list(observation)}")
+    return observation
+
+
+def _numbers(key: str, value: Any) -> Array:
+    """A part of an observation as float64; raises ``ValueError`` unless it is an array of real numbers."""
+    if type(value) is np.ndarray and value.dtype is _FLOAT64:
+        return value
+    try:
+        array = np.asarray(on_host(value))
+    except (TypeError, ValueError):  # rows of different lengths
+        array = np.asarray(None)
+    if array.dtype.kind not in "fiu":
+        raise ValueError(f"{_place(key)} must be an array of real numbers, got {value!r}")
+    return array.astype(np.float64)
+
+
+def _place(key: str) -> str:
+    return f"observation[{key!r}]" if key else "the observation"
+
+
 def check_finite(parts: Mapping[str, NDArray]) -> None:
     """Raise ``ValueError`` that names the key and the place of a number that is not finite."""
     for key, value in parts.items():
         # A sum of squares is finite only if every number is, and takes a third of the time to find out.
         if not np.vdot(value, value) < np.inf and not np.isfinite(value).all():
             where = np.argwhere(~np.isfinite(value))[0].tolist()
-            raise ValueError(f"observation[{key!r}] is not finite at {where}")
+            raise ValueError(f"{_place(key)} is not finite at {where}")
 
 
 def inputs(task: Task, frame: str, observation: dict[str, Array]) -> tuple[Array, Array]:

@@ -272,8 +272,7 @@ class Rise:
         """
         if not self._arrays:
             raise cloning.untrained(self.name)
-        rows, single = readings.as_batch(observation)
-        readings.check_finite(rows)
+        rows, single = readings.checked_batch(self.task, observation)
         robot, reading = self._eyes.inputs(rows)
         mu, sigma = self.encode(reading)
         if deterministic:

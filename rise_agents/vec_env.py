@@ -88,10 +88,18 @@ def random_inputs(
         encode: from batched observations to (B, K).
         seeds: of the first episodes, (B,); the first of them seeds the actions too.
         samples: how many rows to gather, rounded up to whole steps.
+
+    Raises:
+        ValueError: observations that are no arrays of NumPy (those of a backend of torch, say).
     """
     venv.action_space.seed(int(seeds[0]))
     named: Any = [int(seed) for seed in seeds]  # a list is allowed, whatever the annotation says
-    rows = [encode(venv.reset(seed=named)[0])]
+    first = venv.reset(seed=named)[0]
+    for key, part in first.items() if isinstance(first, dict) else [("", first)]:
+        if not isinstance(part, np.ndarray):
+            kind = f"{type(part).__module__}.{type(part).__name__}"
+            raise ValueError(f"training needs observations of NumPy, {venv} gives {key!r} as {kind}")
+    rows = [encode(first)]
     while len(rows) * venv.num_envs < samples:
         rows.append(encode(venv.step(venv.action_space.sample())[0]))
     return np.concatenate(rows)

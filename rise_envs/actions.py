@@ -13,13 +13,13 @@ def finite_action(action: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
     """``action`` as float64.
 
     Raises:
-        ValueError: wrong shape, not numeric, or not finite.
+        ValueError: wrong shape, not of real numbers (a bool is none), or not finite.
     """
     try:
         array = np.asarray(action)
     except ValueError:  # rows of different lengths
         array = np.asarray(None)
-    if array.dtype.kind not in "fiub":
+    if array.dtype.kind not in "fiu":
         raise ValueError(f"action must be numeric with shape {shape}, got {action!r}")
     if array.shape != shape:
         raise ValueError(f"action must have shape {shape}, got shape {array.shape}")

@@ -42,7 +42,7 @@ class EpisodeStreams:
             ValueError: seeds that are not B, or no whole numbers ≥ 0. Nothing has changed then.
         """
         own, count = self._own, self._count
-        seeds = _each(seed, count)
+        seeds = each_seed(seed, count)
         named = np.full(count, True) if isinstance(seeds, range) else np.array([s is not None for s in seeds])
         rows = np.flatnonzero(named if mask is None else named & mask)
         bases = streams.seed_bases(seeds if len(rows) == count else [seeds[i] for i in rows.tolist()])
@@ -59,11 +59,32 @@ class EpisodeStreams:
         return base, number
 
 
-def _each(seed: Seeds, count: int) -> Sequence[Any]:
-    """A seed, or None, for each sub-environment."""
-    if isinstance(seed, int | np.integer):
-        return range(int(seed), int(seed) + count)
-    if not isinstance(seed, Sequence | np.ndarray | None):
+def check_reset(seed: Any, options: Any) -> int | None:
+    """The seed of a single environment's reset as a plain int, or None, before anything has changed.
+
+    Raises:
+        ValueError: a seed that is negative or no whole number, or options that are no dict.
+    """
+    check_options(options)
+    return None if seed is None else streams.checked_seed(seed)
+
+
+def check_options(options: Any) -> None:
+    """Raise ``ValueError`` unless options of a reset are a dict, or None."""
+    if options is not None and not isinstance(options, dict):
+        raise ValueError(f"options must be a dict or None, got {options!r}")
+
+
+def each_seed(seed: Seeds, count: int) -> Sequence[Any]:
+    """A seed, or None, for each sub-environment; raises ``ValueError`` unless it is one, or ``count`` of them."""
+    if isinstance(seed, int | np.integer) and not isinstance(seed, bool):
+        first = streams.checked_seed(seed)
+        return range(first, first + count)
+    if (
+        isinstance(seed, str | bytes)
+        or not isinstance(seed, Sequence | np.ndarray | None)
+        or getattr(seed, "ndim", 1) != 1
+    ):
         raise ValueError(f"a seed must be a whole number, or one for each sub-environment, got {seed!r}")
     seeds = [None] * count if seed is None else seed
     if len(seeds) != count:
@@ -96,10 +117,16 @@ def reset_mask(options: dict[str, Any] | None, count: int, first: bool) -> NDArr
         ValueError: no mask of booleans of length B with at least one True.
         gymnasium.error.ResetNeeded: a mask in the first reset, which must start all.
     """
-    mask = (options or {}).get("reset_mask", np.ones(count, bool))
-    mask = np.asarray(mask.cpu() if hasattr(mask, "cpu") else mask)
+    check_options(options)
+    given = (options or {}).get("reset_mask", np.ones(count, bool))
+    try:
+        mask = np.asarray(given.cpu() if hasattr(given, "cpu") else given)
+    except ValueError:  # rows of different lengths
+        mask = np.asarray(None)
     if mask.shape != (count,) or mask.dtype != bool or not mask.any():
-        raise ValueError(f"options['reset_mask'] must be ({count},) bool with at least one True")
+        raise ValueError(
+            f"options['reset_mask'] must be ({count},) bool with at least one True, got {given!r}"
+        )
     if first and not mask.all():
         raise gym.error.ResetNeeded("the first reset() must start every sub-environment")
     return mask

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -11,7 +12,8 @@ from numpy.typing import NDArray
 
 from rise_envs import goals
 from rise_envs.actions import finite_numbers
-from rise_envs.episodes import EpisodeStreams
+from rise_envs.episodes import EpisodeStreams, check_reset
+from rise_envs.settings import as_settings, flag, whole
 from rise_envs.task import Task
 from rise_envs.vehicle_dynamics import packed
 from rise_envs.vehicle_world import Array, Params, World, sample_starts
@@ -49,24 +51,27 @@ class VehicleTask(goals.GoalAPI):
     """What the single and the batched environment share: arguments, state, goal API, description."""
 
     def __init__(
-        self, reward_type: str, terminate_on_collision: bool, n_obstacles: int, params: Params
+        self,
+        reward_type: str,
+        terminate_on_collision: bool,
+        n_obstacles: int,
+        params: Params | Mapping[str, Any],
     ) -> None:
-        if n_obstacles < 1 or int(n_obstacles) != n_obstacles:
-            raise ValueError(f"n_obstacles must be a whole number of at least 1, got {n_obstacles!r}")
         self.reward_type = goals.check_reward_type(reward_type)
-        self.terminate_on_collision = bool(terminate_on_collision)
-        self.n_obstacles, self.params = int(n_obstacles), params
-        self.constants = params.constants(sparse=reward_type == "sparse")
+        self.terminate_on_collision = flag("terminate_on_collision", terminate_on_collision)
+        self.n_obstacles, self.params = whole("n_obstacles", n_obstacles, 1), as_settings(Params, params)
+        self.constants = self.params.constants(sparse=reward_type == "sparse")
 
     @staticmethod
-    def task(n_obstacles: int = 1, params: Params | None = None, **_: Any) -> Task:
+    def task(n_obstacles: int = 1, params: Params | Mapping[str, Any] | None = None, **_: Any) -> Task:
         """The meaning of the numbers, for agents (see :class:`rise_envs.task.Task`).
 
         The reading noise at level 1 is the paper's N(0, 1) on every channel, in SI units.
         """
-        p = params or DEFAULTS
+        p = DEFAULTS if params is None else as_settings(Params, params)
+        n_obstacles = whole("n_obstacles", n_obstacles, 1)
         scale = (1.0,) * (5 * n_obstacles)
-        return Task(2, n_obstacles, scale, p.robot_radius, p.goal_radius, p.dt, p.v_max, _pose, ())
+        return Task(2, n_obstacles, scale, p.robot_radius, p.goal_radius, p.dt, p.v_max, _pose, (), 3)
 
     @property
     def noise_scale(self) -> dict[str, Array]:
@@ -123,7 +128,7 @@ class GroundVehicleEnv(VehicleTask, gym.Env):
 
     ## Arguments
     `render_mode` (`"rgb_array"` or `"human"`), `reward_type`, `terminate_on_collision`, `n_obstacles`,
-    `params` (:class:`rise_envs.vehicle_world.Params`: every constant of the task).
+    `params` (:class:`rise_envs.vehicle_world.Params`, or a dict of some of its fields: every constant of the task).
 
     ## Versions
     v0: first.
@@ -141,13 +146,13 @@ class GroundVehicleEnv(VehicleTask, gym.Env):
         reward_type: str = "dense",
         terminate_on_collision: bool = False,
         n_obstacles: int = 1,
-        params: Params = DEFAULTS,
+        params: Params | Mapping[str, Any] = DEFAULTS,
     ) -> None:
         super().__init__(reward_type, terminate_on_collision, n_obstacles, params)
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"render_mode must be None, 'rgb_array' or 'human', got {render_mode!r}")
         self.render_mode = render_mode
-        self.observation_space, self.action_space = make_spaces(self.n_obstacles, params)
+        self.observation_space, self.action_space = make_spaces(self.n_obstacles, self.params)
         # The reading as a noise wrapper last handed it out. A window, which draws within the step, shows the
         # one that the step's action was based on.
         self.perceived: Array | None = None
@@ -192,7 +197,13 @@ class GroundVehicleEnv(VehicleTask, gym.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Array], dict[str, Any]]:
-        """Start an episode; with ``seed`` the one that this seed names."""
+        """Start an episode; with ``seed`` the one that this seed names.
+
+        Raises:
+            ValueError: a seed that is negative or no whole number, options that are no dict, or parameters that
+                leave no room for a fair start.
+        """
+        seed = check_reset(seed, options)
         super().reset(seed=seed)
         self._streams.seed(seed, rng=self.np_random)
         base, number = self._streams.next(np.array([0]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from rise_envs.episodes import EpisodeStreams, Seeds, check_running, reset_mask, space_of_many
 from rise_envs.ground_vehicle import DEFAULTS, VehicleTask, make_spaces
+from rise_envs.settings import whole
 from rise_envs.vehicle_backend import choose
 from rise_envs.vehicle_world import Outcome, Params, World, copied
 
@@ -59,7 +61,7 @@ class GroundVehicleVectorEnv(VehicleTask, VectorEnv):
         reward_type: str = "dense",
         terminate_on_collision: bool = False,
         n_obstacles: int = 1,
-        params: Params = DEFAULTS,
+        params: Params | Mapping[str, Any] = DEFAULTS,
         render_mode: str | None = None,
         backend: str = "numpy",
         device: str = "cpu",
@@ -68,12 +70,12 @@ class GroundVehicleVectorEnv(VehicleTask, VectorEnv):
         super().__init__(reward_type, terminate_on_collision, n_obstacles, params)
         if render_mode is not None:
             raise ValueError("the batched vehicles are not drawn: render a single environment instead")
-        if min(num_envs, max_episode_steps) < 1:
-            raise ValueError(f"num_envs={num_envs} and max_episode_steps={max_episode_steps} must be ≥ 1")
+        num_envs = whole("num_envs", num_envs, 1)
+        max_episode_steps = whole("max_episode_steps", max_episode_steps, 1)
         self.num_envs, self.render_mode, self.max_episode_steps = num_envs, None, max_episode_steps
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
-        self.single_observation_space, self.single_action_space = make_spaces(self.n_obstacles, params)
+        self.single_observation_space, self.single_action_space = make_spaces(self.n_obstacles, self.params)
         self.observation_space = space_of_many(self.single_observation_space, num_envs)
         self.action_space = space_of_many(self.single_action_space, num_envs)
         self._backend = choose(backend, device, compiled)

@@ -12,6 +12,7 @@ import numpy as np
 from array_api_compat import array_namespace, device
 
 from rise_envs import streams
+from rise_envs.settings import finite
 
 # Arrays of NumPy, or tensors on any device of torch; the arguments of a call are all of one library.
 Array = Any  # float64
@@ -61,11 +62,7 @@ def _parts(model: NoiseModel) -> tuple[NoiseModel, ...]:
 
 def require(name: str, value: Any, low: float = 0.0, high: float = math.inf) -> None:
     """Raise ``ValueError`` unless ``value`` is a finite number in [low, high]."""
-    number = isinstance(value, int | float | np.integer | np.floating)
-    # A comparison with NaN is false, so that NaN is refused as well.
-    if not number or not low <= value <= high or math.isinf(value):
-        bounds = f"≥ {low:g}" if math.isinf(high) else f"in [{low:g}, {high:g}]"
-        raise ValueError(f"{name} must be a finite number {bounds}, got {value!r}")
+    finite(name, value, low, high)
 
 
 # Draws for the coming steps wait in the state as a block (B, ahead, C): an episode on its own then pays for
@@ -234,6 +231,7 @@ class Delay(NoiseModel):
 
     def at(self, level: float) -> NoiseModel:
         """The delay times ``level``, in whole steps."""
+        require("delay: steps · noise_level", self.steps * level, 0, MAX_DELAY)
         return replace(self, steps=math.floor(self.steps * level + 0.5))
 
     def reset(self, keys: Keys, channels: int, ahead: int = 1) -> State:

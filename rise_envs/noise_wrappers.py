@@ -25,6 +25,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
 from rise_envs import streams
+from rise_envs.episodes import check_options, check_reset, each_seed, reset_mask
 from rise_envs.noise import make_noise
 from rise_envs.noise_channels import Channels, Scale, own_copy, placed
 from rise_envs.noise_models import Array, Keys, NoiseModel, State, Steps
@@ -102,7 +103,10 @@ def _noise_seeds(options: dict[str, Any] | None, n: int) -> tuple[list[int] | No
     rest = {key: value for key, value in options.items() if key != "noise_seed"}
     if options["noise_seed"] is None:
         return None, rest or None
-    seeds = np.asarray(options["noise_seed"])
+    try:
+        seeds = np.asarray(options["noise_seed"])
+    except ValueError:  # rows of different lengths
+        seeds = np.asarray(None)
     if seeds.shape not in ((), (n,)) or seeds.dtype.kind not in "iu" or (seeds < 0).any():
         raise ValueError(
             f"options['noise_seed'] must be a whole number ≥ 0 (or {n} of them, one for each environment), "
@@ -159,8 +163,10 @@ class ObservationNoise(gym.Wrapper, RecordConstructorArgs):
         """Start an episode and its noise; ``options["noise_seed"]`` names the noise apart from ``seed``.
 
         Raises:
-            ValueError: a noise seed that is no whole number ≥ 0.
+            ValueError: a seed or noise seed that is no whole number ≥ 0, or options that are no dict. Nothing has
+                changed then; a reading that is no finite number in the shape of its space.
         """
+        seed = check_reset(seed, options)
         noise_seeds, options = _noise_seeds(options, 1)
         observation, info = self.env.reset(seed=seed, options=options)
         if seed is not None:
@@ -170,7 +176,11 @@ class ObservationNoise(gym.Wrapper, RecordConstructorArgs):
         return self._hand_out(observation, noisy, info)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Step the environment; its observation is read with noise, the last one of an episode too."""
+        """Step the environment; its observation is read with noise, the last one of an episode too.
+
+        Raises:
+            ValueError: a reading that is no finite number in the shape of its space.
+        """
         observation, reward, terminated, truncated, info = self.env.step(action)
         noisy = self._rows.advance(self.channels.read(observation))
         observation, info = self._hand_out(observation, noisy, info)
@@ -232,20 +242,24 @@ class VectorObservationNoise(VectorWrapper, RecordConstructorArgs):
         """Start all episodes, or those of ``options["reset_mask"]``, and their noise.
 
         Raises:
-            ValueError: noise seeds that are not whole numbers ≥ 0, or not B of them.
+            ValueError: seeds or noise seeds that are not whole numbers ≥ 0, or not B of them, no mask of B booleans,
+                or options that are no dict. Nothing has changed then; a reading as in :class:`ObservationNoise`.
         """
         n = self.num_envs
+        check_options(options)
         noise_seeds, options = _noise_seeds(options, n)
-        rows = (options or {}).get("reset_mask", np.ones(n, dtype=bool))
-        rows = np.array(rows.cpu() if hasattr(rows, "cpu") else rows)
+        rows = reset_mask(options, n, first=self._noisy is None).copy()
+        seeds = each_seed(seed, n)
+        named = rows & np.array([wanted is not None for wanted in seeds])
+        # Checked before the environment moves, which may know no check of its own; a range needs but one.
+        chosen = [seeds[i] for i in np.flatnonzero(named).tolist()]
+        for one in chosen[:1] if isinstance(seeds, range) else chosen:
+            streams.checked_seed(one)
         # The environment may pop the mask from its options: they get a dict of their own.
         clean, infos = self.env.reset(seed=seed, options=dict(options) if options else options)  # type: ignore[arg-type]
         if seed is not None:
-            seeds = range(int(seed), int(seed) + n) if isinstance(seed, int | np.integer) else seed
-            named = rows & np.array([wanted is not None for wanted in seeds])
-            chosen = [seeds[i] for i in np.flatnonzero(named).tolist()]
             self._rows.seed(named, seeds if len(chosen) == n else chosen)  # type: ignore[arg-type]
-        reading = self.channels.read(clean, n)
+        reading = self.channels.read(clean, (n,))
         noisy = reading if self._noisy is None else own_copy(self._noisy)
         noisy[rows] = self._rows.start(reading, rows, noise_seeds)
         self._done = self._done & ~placed(rows, self._done)
@@ -256,7 +270,7 @@ class VectorObservationNoise(VectorWrapper, RecordConstructorArgs):
         """Step all environments; rows that the environment resets begin a new episode of noise."""
         n = self.num_envs
         clean, rewards, terminated, truncated, infos = self.env.step(actions)
-        reading = self.channels.read(clean, n)
+        reading = self.channels.read(clean, (n,))
         ended = terminated | truncated
         infos = {**infos, **self._clean_info(clean, np.ones(n, dtype=bool))}
         if self._mode == AutoresetMode.SAME_STEP and ended.any():
@@ -287,7 +301,7 @@ class VectorObservationNoise(VectorWrapper, RecordConstructorArgs):
                 final_obs[i] = self.channels.write(observation, noisy[i : i + 1])
                 final_info = self._add_info(final_info, {"clean_observation": own_copy(observation)}, i)
         else:  # one batch, right in the rows that ended
-            noisy = own_copy(self._rows.advance(self.channels.read(infos["final_obs"], self.num_envs)))
+            noisy = own_copy(self._rows.advance(self.channels.read(infos["final_obs"], (self.num_envs,))))
             final_obs = self.channels.write(infos["final_obs"], noisy, (self.num_envs,))
             final_info |= self._clean_info(infos["final_obs"], ended)
         noisy[ended] = self._rows.start(reading, ended)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from rise_envs import obstacles
+from rise_envs.settings import check_fields
 
 START_HAND = (0.0384397, 0.0, 0.1974001)  # the hand point in the neutral pose (m)
 
@@ -55,6 +56,25 @@ class Params:
     hand_radius: float = 0.05
     noise_scale: tuple[float, float, float] = (0.05, 0.05, 0.02)
 
+    def __post_init__(self) -> None:
+        check_fields(type(self), vars(self))
+        for name in ("goal_radius", "reach", "redraw_interval", "max_hand_speed"):
+            require(getattr(self, name) > 0, f"{name} must be > 0", self)
+        for name in ("max_speed", "goal_gap", "max_offset", "start_time", "hand_radius"):
+            require(getattr(self, name) >= 0, f"{name} must not be negative", self)
+        require(min(self.noise_scale) >= 0, "noise_scale must not be negative", self)
+        for name in ("radius", "placed"):
+            low, high = getattr(self, name)
+            require(0 <= low <= high, f"{name} must not be negative and in rising order", self)
+        for name in ("goal", "sphere"):
+            corners = zip(getattr(self, f"{name}_low"), getattr(self, f"{name}_high"), strict=True)
+            require(all(a <= b for a, b in corners), f"{name}_low must not exceed {name}_high", self)
+        require(
+            self.goal_min_distance > self.goal_radius,
+            "goal_min_distance must exceed goal_radius, or episodes start at the goal",
+            self,
+        )
+
     @property
     def dt(self) -> float:
         """Duration of a control step (s): panda-gym's 20 substeps of 2 ms."""
@@ -71,6 +91,12 @@ class Params:
             high=self.sphere_high,
             goal_gap=self.goal_gap,
         )
+
+
+def require(condition: bool, what: str, params: Params) -> None:
+    """Raise ``ValueError`` that says what a parameter must be."""
+    if not condition:
+        raise ValueError(f"panda_scene.Params.{what}, got {params}")
 
 
 DEFAULTS = Params()

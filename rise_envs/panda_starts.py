@@ -190,13 +190,13 @@ def begin(keys: Whole, c: Constants) -> tuple[Array, Array, Whole, Array, Whole]
         motion (B,), and the clearance of the capsules (m) with the nearest one, (B,) each.
 
     Raises:
-        RuntimeError: the parameters leave goal or sphere no room.
+        ValueError: the parameters leave goal or sphere no room.
     """
     count = len(keys)
     goal, sphere, motion = np.empty((count, 3)), np.empty((count, 7)), np.empty(count, np.int64)
     clearance = np.empty((count, 2))
     if not _begin(keys, _CAPSULES, c, goal, sphere, motion, clearance):
-        raise RuntimeError("no fair start found: these parameters leave goal or sphere no room")
+        raise ValueError("no fair start found: these parameters leave goal or sphere no room")
     return goal, sphere, motion, clearance[:, 0].copy(), clearance[:, 1].astype(np.int64)
 
 

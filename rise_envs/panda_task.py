@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from rise_envs import goals
 from rise_envs.panda_scene import DEFAULTS, Params
+from rise_envs.settings import as_settings, flag
 from rise_envs.task import Task
 
 Array = NDArray[np.float64]
@@ -18,18 +20,20 @@ Array = NDArray[np.float64]
 class PandaTask(goals.GoalAPI):
     """Mixed into the environments: see :class:`rise_envs.safe_panda.SafePandaEnv` for all meanings."""
 
-    def __init__(self, reward_type: str, terminate_on_collision: bool, params: Params) -> None:
+    def __init__(
+        self, reward_type: str, terminate_on_collision: bool, params: Params | Mapping[str, Any]
+    ) -> None:
         self.reward_type = goals.check_reward_type(reward_type)
-        self.terminate_on_collision = bool(terminate_on_collision)
-        self.params = params
+        self.terminate_on_collision = flag("terminate_on_collision", terminate_on_collision)
+        self.params = as_settings(Params, params)
 
     @staticmethod
-    def task(params: Params = DEFAULTS, **_: Any) -> Task:
+    def task(params: Params | Mapping[str, Any] = DEFAULTS, **_: Any) -> Task:
         """The meaning of the numbers, for agents (see :class:`rise_envs.task.Task`).
 
         The reading noise at level 1 has the ratio to the sphere's size that the vehicle's task has.
         """
-        p = params
+        p = as_settings(Params, params)
         scale = tuple(np.repeat(p.noise_scale, (3, 3, 1)).tolist())
         return Task(
             dim=3,
@@ -41,6 +45,7 @@ class PandaTask(goals.GoalAPI):
             max_speed=p.max_hand_speed,
             pose=_pose,
             body_state=tuple(range(13)),
+            state_size=13,
         )
 
     @property

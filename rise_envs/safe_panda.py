@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from rise_envs import goals
 from rise_envs.actions import finite_numbers
-from rise_envs.episodes import EpisodeStreams
+from rise_envs.episodes import EpisodeStreams, check_reset
 from rise_envs.panda_scene import DEFAULTS, Params
 from rise_envs.panda_task import PandaTask, make_spaces
 from rise_envs.streams import episode_keys
@@ -79,7 +80,8 @@ class SafePandaEnv(PandaTask, gym.Env):
 
     ## Arguments
     `render_mode` (`"rgb_array"`), `reward_type`, `terminate_on_collision`, `params`
-    (:class:`rise_envs.panda_scene.Params`: every constant of the task).
+    (:class:`rise_envs.panda_scene.Params`, or a dict of some of its fields: every constant of
+    the task).
 
     ## Versions
     v0: first.
@@ -98,19 +100,19 @@ class SafePandaEnv(PandaTask, gym.Env):
         render_mode: str | None = None,
         reward_type: str = "dense",
         terminate_on_collision: bool = False,
-        params: Params = DEFAULTS,
+        params: Params | Mapping[str, Any] = DEFAULTS,
     ) -> None:
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
         super().__init__(reward_type, terminate_on_collision, params)
         self.render_mode = render_mode
-        self.observation_space, self.action_space = make_spaces(params)
+        self.observation_space, self.action_space = make_spaces(self.params)
         self.perceived: Array | None = None  # the reading as a noise wrapper last handed it out
         self._streams = EpisodeStreams(1)
         self._sphere: Array | None = None  # its true reading, (1, 7)
         from rise_envs import panda_sim, panda_starts  # the engine is loaded by those who run the arm only
 
-        self._starts, self._constants = panda_starts, panda_starts.constants(params)
+        self._starts, self._constants = panda_starts, panda_starts.constants(self.params)
         self._sim: PandaSim | None = panda_sim.PandaSim(visuals=render_mode is not None)
 
     def reset(
@@ -119,8 +121,11 @@ class SafePandaEnv(PandaTask, gym.Env):
         """Start an episode; with ``seed`` the one that this seed names.
 
         Raises:
-            RuntimeError: the environment is closed, or its parameters leave no room for a fair start.
+            ValueError: a seed that is negative or no whole number, options that are no dict, or parameters that
+                leave no room for a fair start.
+            RuntimeError: the environment is closed.
         """
+        seed = check_reset(seed, options)
         super().reset(seed=seed)
         sim = self._open_sim()
         self._streams.seed(seed, rng=self.np_random)

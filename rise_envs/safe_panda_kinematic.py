@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from rise_envs import goals
 from rise_envs.actions import finite_action
-from rise_envs.episodes import EpisodeStreams
+from rise_envs.episodes import EpisodeStreams, check_reset
 from rise_envs.panda_scene import DEFAULTS, Params
 from rise_envs.panda_task import PandaTask, make_spaces
 from rise_envs.streams import episode_keys
@@ -72,24 +73,29 @@ class SafePandaKinematicEnv(PandaTask, gym.Env):
         render_mode: str | None = None,
         reward_type: str = "dense",
         terminate_on_collision: bool = False,
-        params: Params = DEFAULTS,
+        params: Params | Mapping[str, Any] = DEFAULTS,
     ) -> None:
         check_no_pictures(render_mode)
         super().__init__(reward_type, terminate_on_collision, params)
         self.render_mode = None
-        self.observation_space, self.action_space = make_spaces(params)
+        self.observation_space, self.action_space = make_spaces(self.params)
         self.perceived: Array | None = None  # where a noise wrapper leaves the reading
         self._streams = EpisodeStreams(1)
         self._world: World | None = None
         from rise_envs import panda_world  # numba is loaded by those who make an arm only
 
         self._worlds = panda_world
-        self._constants = panda_world.panda_starts.constants(params)
+        self._constants = panda_world.panda_starts.constants(self.params)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Array], dict[str, Any]]:
-        """Start an episode; with ``seed`` the one that this seed names."""
+        """Start an episode; with ``seed`` the one that this seed names.
+
+        Raises:
+            ValueError: as for ``RISE-SafePanda-v0``.
+        """
+        seed = check_reset(seed, options)
         super().reset(seed=seed)
         self._streams.seed(seed, rng=self.np_random)
         world = self._worlds.begin(episode_keys(*self._streams.next(np.array([0]))), self._constants)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, cast
 
 import gymnasium as gym
@@ -18,6 +19,7 @@ from rise_envs.panda_starts import constants
 from rise_envs.panda_task import PandaTask, make_spaces
 from rise_envs.panda_world import World, advance, begin, observe, replaced, report
 from rise_envs.safe_panda_kinematic import check_no_pictures
+from rise_envs.settings import whole
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
@@ -52,20 +54,20 @@ class SafePandaKinematicVectorEnv(PandaTask, VectorEnv):
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         reward_type: str = "dense",
         terminate_on_collision: bool = False,
-        params: Params = DEFAULTS,
+        params: Params | Mapping[str, Any] = DEFAULTS,
         render_mode: str | None = None,
     ) -> None:
         check_no_pictures(render_mode)
-        if min(num_envs, max_episode_steps) < 1:
-            raise ValueError(f"num_envs={num_envs} and max_episode_steps={max_episode_steps} must be ≥ 1")
+        num_envs = whole("num_envs", num_envs, 1)
+        max_episode_steps = whole("max_episode_steps", max_episode_steps, 1)
         super().__init__(reward_type, terminate_on_collision, params)
         self.num_envs, self.render_mode, self.max_episode_steps = num_envs, None, max_episode_steps
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
-        self.single_observation_space, self.single_action_space = make_spaces(params)
+        self.single_observation_space, self.single_action_space = make_spaces(self.params)
         self.observation_space = space_of_many(self.single_observation_space, num_envs)
         self.action_space = space_of_many(self.single_action_space, num_envs)
-        self._constants = constants(params)
+        self._constants = constants(self.params)
         self._streams = EpisodeStreams(num_envs)
         self._world: World | None = None
         self._ended = np.zeros(num_envs, bool)

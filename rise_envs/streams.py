@@ -101,14 +101,22 @@ def seed_bases(seeds: Sequence[int]) -> NDArray[np.int64]:
     return seed_keys(seeds, _EPISODES).view(np.int64)
 
 
-def _word(seed: int) -> int:
-    """A seed as 64 bits: itself, if it is no longer."""
+def checked_seed(seed: Any) -> int:
+    """A seed as a plain int, of any size; raises ``ValueError`` if it is negative or no whole number."""
     try:
         whole = operator.index(seed)
     except TypeError:
-        raise ValueError(f"a seed must be a whole number, got {seed!r}") from None
+        whole = None
+    if whole is None or isinstance(seed, bool | np.bool_):
+        raise ValueError(f"a seed must be a whole number, got {seed!r}")
     if whole < 0:
         raise ValueError(f"a seed must not be negative, got {whole}")
+    return whole
+
+
+def _word(seed: int) -> int:
+    """A seed as 64 bits: itself, if it is no longer."""
+    whole = checked_seed(seed)
     return whole if whole < 2**64 else int(key_from_seed(whole))
 
 

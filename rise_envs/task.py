@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import gymnasium as gym
@@ -35,6 +36,7 @@ class Task:
         pose: maps states (B, S) to the robot's frame: position (B, D) and rotation (B, D, D), whose columns
             are the frame's axes in world coordinates.
         body_state: columns of the state that keep their meaning when the world is seen from the robot.
+        state_size: S.
     """
 
     dim: int
@@ -46,6 +48,18 @@ class Task:
     max_speed: float
     pose: Callable[[Array], tuple[Array, Array]]
     body_state: tuple[int, ...]
+    state_size: int
+
+    @cached_property
+    def widths(self) -> dict[str, int]:
+        """How many numbers each part of an observation has that a policy reads."""
+        reading = self.n_obstacles * (2 * self.dim + 1)
+        return {"observation": self.state_size, "desired_goal": self.dim, "obstacle": reading}
+
+    @cached_property
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """The shapes of these parts in a single observation."""
+        return {key: (width,) for key, width in self.widths.items()}
 
     def split(self, reading: Array) -> tuple[Array, Array, Array]:
         """Readings (B, C) as positions (B, N, D), velocities (B, N, D) and radii (B, N)."""

@@ -81,12 +81,15 @@ def _with_torch(dynamics: Any, device: str, compiled: bool) -> Backend:
         return finite_action(values, shape)
 
     def on_device(values: Any, shape: tuple[int, ...]) -> Any:
-        if not isinstance(values, torch.Tensor) or values.shape != shape or values.is_complex():
+        if not isinstance(values, torch.Tensor) or values.shape != shape or not _is_real(values):
             return torch.as_tensor(on_host(values, shape), device=place)
         if not bool(torch.isfinite(values).all()):
             where = torch.nonzero(~torch.isfinite(values))[0].tolist()
             raise ValueError(f"action must be finite, got {values[tuple(where)].item()} at index {where}")
         return values.detach().to(place, torch.float64)
+
+    def _is_real(values: Any) -> bool:
+        return not values.is_complex() and values.dtype != torch.bool
 
     if compiled:  # tensors and arrays share their memory on the CPU
         return Backend(dynamics, _same, torch.from_numpy, on_host, torch.get_num_threads())

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rise_envs.obstacles import Motion
+from rise_envs.settings import check_fields
 from rise_envs.vehicle_dynamics import MAX_ATTEMPTS, Constants
 
 Array = NDArray[np.float64]
@@ -41,6 +42,7 @@ class Params:
     start_horizon: float = 1.0
 
     def __post_init__(self) -> None:
+        check_fields(type(self), vars(self))
         for field in fields(self):
             value = np.atleast_1d(getattr(self, field.name))
             low = -np.inf if field.name == "v_min" else 0.0

@@ -147,6 +147,42 @@ def test_minari_round_trip(vehicle_demonstrations, tmp_path, monkeypatch):
         minari_io.load("rise/vehicle-v0", "RISE-SafePanda-v0")
 
 
+@pytest.fixture
+def exported(vehicle_demonstrations, tmp_path, monkeypatch):
+    """The folder of a Minari dataset ``rise/vehicle-v0``."""
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    minari_io.export(vehicle_demonstrations.first(2), "rise/vehicle-v0")
+    return tmp_path / "rise" / "vehicle-v0" / "data"
+
+
+def test_a_changed_number_in_a_minari_set_is_noticed(exported):
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(exported / "main_data.hdf5", "r+") as file:
+        file["episode_0/rewards"][3] += 1e-6
+    with pytest.raises(DatasetError, match="SHA-256"):
+        minari_io.load("rise/vehicle-v0", VEHICLE)
+
+
+@pytest.mark.parametrize("without", [(), ("observation_space",), ("action_space", "observation_space")])
+def test_an_environment_that_a_minari_set_names_is_never_built(exported, monkeypatch, without):
+    """Minari itself builds it where the spaces are missing, and so runs what the file names."""
+    (exported / "evil_module.py").write_text("open('run', 'w').close()\nclass Env: pass")
+    monkeypatch.syspath_prepend(exported)
+    monkeypatch.chdir(exported)
+    metadata = json.loads((exported / "metadata.json").read_text())
+    spec = json.loads(metadata["env_spec"])
+    metadata["env_spec"] = json.dumps({**spec, "entry_point": "evil_module:Env"})
+    for name in without:
+        del metadata[name]
+    (exported / "metadata.json").write_text(json.dumps(metadata))
+    if without:
+        with pytest.raises(DatasetError, match=f"no {without[-1]}"):
+            minari_io.load("rise/vehicle-v0", VEHICLE)
+    else:
+        minari_io.load("rise/vehicle-v0", VEHICLE)
+    assert not (exported / "run").exists()
+
+
 def test_command_line(tmp_path, capsys):
     out = tmp_path / "set"
     arguments = ["--env", VEHICLE, "--expert", "cbf", "--episodes", "5", "--workers", "1", "--out", str(out)]

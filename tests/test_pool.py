@@ -5,6 +5,8 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -53,7 +55,7 @@ def test_results_errors_deaths_and_what_tasks_tell():
         ended |= everything(pool, 2)
     assert (ended["a"].result, ended["d"].result) == (9, 16)
     assert ended["b"].died == "SIGKILL"
-    assert ended["c"].error == "KeyError: 'nothing here'"
+    assert ended["c"].error == "KeyError: 'nothing here'" and "_fail" in ended["c"].trace
     assert told == [("a", ("half", 3)), ("d", ("half", 4))]
 
 
@@ -140,7 +142,9 @@ def test_a_killed_worker_is_named_and_its_job_tried_again_up_to_a_limit(tmp_path
     }
     assert (tmp_path / "a").read_text() == (tmp_path / "d").read_text() == "done"
     assert sum("third time" in line and "SIGTERM" in line for line in said) == 2
-    assert sum("never" in line and "SIGKILL" in line for line in said) == ATTEMPTS - 1
+    assert (
+        sum("never: its" in line and "SIGKILL" in line and "attempt" in line for line in said) == ATTEMPTS - 1
+    )
     assert ("fine", 0.5) in seen and ("fine", 1.0) in seen
 
 
@@ -154,3 +158,44 @@ def test_jobs_wait_for_what_they_need(tmp_path, workers):
     done = lambda job, share, figures: order.append(job.name) if share == 1 else None  # noqa: E731
     assert not run_jobs(jobs, workers, done)
     assert order == ["first", "second"]
+
+
+_INTERRUPTED = """
+import sys
+from pathlib import Path
+sys.path.insert(0, {tests!r})
+from test_pool import _sleep
+from rise_agents.pool import Pool
+
+if __name__ == "__main__":
+    try:
+        with Pool(2) as pool:
+            for n in range(2):
+                pool.start(n, _sleep, f"pid{{n}}")
+            while True:
+                pool.wait()
+    except KeyboardInterrupt:
+        print("interrupted")
+"""
+
+
+def test_ctrl_c_reaches_the_parent_only(tmp_path):
+    """A terminal sends it to the whole group; the workers say nothing and are gone."""
+    script = tmp_path / "script.py"
+    script.write_text(_INTERRUPTED.format(tests=str(Path(__file__).parent)))
+    process = subprocess.Popen(
+        [sys.executable, str(script)],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])},
+    )
+    paths = [tmp_path / f"pid{n}" for n in range(2)]
+    while not all(path.exists() and path.read_text() for path in paths):
+        time.sleep(0.01)
+    os.killpg(process.pid, signal.SIGINT)
+    out, error = process.communicate(timeout=60)
+    assert (out, error) == ("interrupted\n", "")
+    assert all(_gone(int(path.read_text())) for path in paths)

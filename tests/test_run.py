@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 
 import imageio.v3 as iio
 import numpy as np
@@ -11,9 +12,10 @@ import pytest
 
 from benchmarks import results
 from benchmarks.executors import run_jobs
-from benchmarks.jobs import Job
+from benchmarks.jobs import Job, demonstrations_folder
 from benchmarks.protocol import PRESETS, make_plan
 from benchmarks.run import main, parser, plan_of
+from rise_agents.files import sole_user
 from rise_agents.seeds import SPLITS
 from rise_envs import ENVS, STAND_INS
 
@@ -49,7 +51,7 @@ def test_every_promised_file_is_there(run):
     }
     assert len(list((run / "videos").glob("*.mp4"))) == 3
     assert len(list((run / "videos").glob("*-frames.png"))) == 3
-    assert not list(run.rglob("*.tmp"))
+    assert not list(run.rglob(".partial-*"))
 
 
 def test_rows_are_paired_test_scenarios(run):
@@ -184,3 +186,53 @@ def test_a_failing_job_is_named_and_stops_only_what_needs_it(tmp_path):
         "after": "a job that it needs failed",
     }
     assert good.read_text() == "2"
+
+
+def test_a_second_run_in_the_same_folder_is_refused(tmp_path, capsys):
+    with sole_user(tmp_path):
+        assert main([*SMALL, "--out", str(tmp_path)]) == 1
+    assert "in use by another process" in capsys.readouterr().err
+    assert {path.name for path in tmp_path.iterdir()} <= {".lock"}
+
+
+def test_what_a_killed_run_left_is_swept_and_what_it_finished_is_kept(run, tmp_path):
+    """Half of the outputs are there already, and strays in every folder: only the rest is done, to the same tables."""
+    shutil.copytree(run, tmp_path / "run")
+    out = tmp_path / "run"
+    kept = sorted(path for path in (out / "parts").rglob("*.parquet"))
+    for path in kept[::2]:
+        path.unlink()
+    for folder in (out, out / "parts" / VEHICLE, out / "agents" / VEHICLE):
+        (folder / ".partial-0123-episodes.parquet").write_bytes(b"half")
+    before = {path: path.stat().st_mtime_ns for path in [*kept[1::2], *(out / "agents").rglob("*.rise")]}
+    assert main([*SMALL, "--workers", "1", "--no-videos", "--out", str(out)]) == 0
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+    assert not list(out.rglob(".partial-*"))
+    for name in ("episodes.parquet", "summary.csv"):
+        assert (out / name).read_bytes() == (run / name).read_bytes()
+
+
+def test_failures_end_in_exit_code_1_and_are_recorded(tmp_path, capsys, monkeypatch):
+    """A damaged set of demonstrations fails what needs it, in one line each; the rest is done."""
+    arguments = [
+        *SMALL,
+        "--agents",
+        "pcbc",
+        "random",
+        "--no-videos",
+        "--workers",
+        "1",
+        "--out",
+        str(tmp_path),
+    ]
+    folder = demonstrations_folder(plan_of(parser().parse_args(arguments)), VEHICLE, tmp_path)
+    folder.mkdir(parents=True)
+    (folder / "demonstrations.rise").write_bytes(b"RISEfile and nothing else")
+    assert main(arguments) == 1
+    error = capsys.readouterr().err
+    assert "damaged" in error and "Traceback" not in error
+    failed = json.loads((tmp_path / "run.json").read_text())["failed"]
+    assert f"train pcbc on {VEHICLE}" in failed
+    assert "DatasetError" in (tmp_path / "failures.log").read_text()
+    agents = {row["agent"] for row in results.read_rows(tmp_path / "episodes.parquet").to_pylist()}
+    assert agents == {"random"}

@@ -322,7 +322,7 @@ def test_driving_straight_at_the_goal_arrives_and_is_mostly_unsafe(made: SafePan
 
 def test_parameters_without_room_are_refused() -> None:
     env = SafePandaEnv(params=Params(goal_gap=2.0))
-    with pytest.raises(RuntimeError, match="room"):
+    with pytest.raises(ValueError, match="room"):
         env.reset(seed=0)
     env.close()
 

@@ -99,7 +99,7 @@ def test_parameters_without_room_are_refused() -> None:
         SafePandaKinematicEnv(params=Params(goal_gap=2.0)),
         gym.make_vec(MODEL, 2, params=Params(goal_gap=2.0)),
     ):
-        with pytest.raises(RuntimeError, match="room"):
+        with pytest.raises(ValueError, match="room"):
             env.reset(seed=0)
 
 

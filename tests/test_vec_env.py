@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import time
+from pathlib import Path
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -169,3 +173,25 @@ def test_unbounded_actions_are_refused():
     with pytest.raises(ValueError, match="finite bounds"):
         vec_env.action_bounds(spaces.Box(-np.inf, 1.0, (1,)))
     assert vec_env.action_bounds(spaces.Discrete(2)) is None
+
+
+def _train_for_ever(pids):
+    venv = vec_env.make_training_env("CartPole-v1", 3)
+    venv.reset(seed=0)
+    for process in venv.processes:
+        pids.put(process.pid)
+    time.sleep(60)
+
+
+def test_sub_environments_end_with_a_trainer_that_is_killed():
+    context = multiprocessing.get_context("spawn")
+    pids = context.Queue()
+    trainer = context.Process(target=_train_for_ever, args=(pids,))
+    trainer.start()
+    children = [pids.get(timeout=60) for _ in range(3)]
+    trainer.kill()
+    trainer.join()
+    deadline = time.monotonic() + 30
+    while any(Path(f"/proc/{pid}").exists() for pid in children) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not [pid for pid in children if Path(f"/proc/{pid}").exists()]

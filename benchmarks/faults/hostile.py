@@ -294,7 +294,12 @@ def arrays_changed(rng: np.random.Generator, sample: Sample) -> bytes:
     elif kind == 1:
         arrays[str(rng.choice(["extra", f"{name}.extra", "policy.99.weight", ""]))] = np.zeros(3, np.float32)
     elif kind == 2:
-        shapes: list[NDArray] = [array[..., None], array[None], np.concatenate([array, array]), array[:0]]
+        shapes: list[NDArray] = [
+            array[..., None],
+            array[None],
+            np.concatenate([np.atleast_1d(array)] * 2),
+            np.atleast_1d(array)[:0],
+        ]
         arrays[name] = shapes[int(rng.integers(len(shapes)))]
     elif kind == 3 and number:
         array.flat[int(rng.integers(array.size))] = float(rng.choice([np.nan, np.inf, -np.inf]))

@@ -16,7 +16,7 @@ from rise_agents.demonstrations.dataset import (
 )
 from rise_envs.task import env_class
 
-_SEED, _EXPERT = "rise_seed", "rise_expert"
+_SEED, _EXPERT, _DIGEST = "rise_seed", "rise_expert", "rise_sha256"
 
 
 def check_id(dataset_id: str) -> None:
@@ -75,7 +75,7 @@ def export(d: Demonstrations, dataset_id: str) -> None:
         with warnings.catch_warnings():
             # Minari asks for authors and links, which a local export has none of.
             warnings.simplefilter("ignore", UserWarning)
-            minari.create_dataset_from_buffers(
+            created = minari.create_dataset_from_buffers(
                 dataset_id,
                 buffer=buffers,
                 env=d.env_id,
@@ -86,6 +86,7 @@ def export(d: Demonstrations, dataset_id: str) -> None:
                 description=f"Safe and successful expert episodes of {d.env_id}",
                 data_format="hdf5",
             )
+            created.storage.update_metadata({_DIGEST: d.digest()})  # HDF5 notices no flipped bit
     finally:
         env.close()
 
@@ -97,31 +98,52 @@ def load(dataset_id: str, env_id: str) -> Demonstrations:
     used, since building it would run what it says.
 
     Raises:
-        DatasetError: no such dataset, or its contents are not safe episodes of that environment.
+        DatasetError: no such dataset, damaged since :func:`export`, or not safe episodes of that environment.
     """
-    import minari
-
     try:
-        dataset = minari.load_dataset(dataset_id)
-    except (FileNotFoundError, ValueError, KeyError) as error:
+        metadata, episodes = _read(dataset_id)
+        demonstrations = from_arrays(env_id, _arrays(episodes), _card(dataset_id, episodes))
+    except DatasetError as error:
+        raise DatasetError(f"Minari dataset {dataset_id!r}: {error}") from None
+    except Exception as error:  # of Minari, HDF5 or NumPy: whatever a file can hold
         raise DatasetError(f"Minari dataset {dataset_id!r} cannot be loaded: {error}") from None
-    episodes = list(dataset.iterate_episodes())
+    if metadata.get(_DIGEST, demonstrations.digest()) != demonstrations.digest():
+        raise DatasetError(f"Minari dataset {dataset_id!r} is damaged: its SHA-256 does not match")
+    return demonstrations
+
+
+def _read(dataset_id: str) -> tuple[dict[str, Any], list[Any]]:
+    """The metadata and the episodes of a local dataset, without building an environment."""
+    import minari
+    from minari.dataset.minari_storage import MinariStorage
+    from minari.storage.datasets_root_dir import get_dataset_path
+
+    metadata = dict(MinariStorage.read_raw_metadata(get_dataset_path(dataset_id) / "data"))
+    for name in ("observation_space", "action_space"):
+        # Minari would build the stored environment to ask for its spaces, and with it run what a file names.
+        if not isinstance(metadata.get(name), str):
+            raise DatasetError(f"its metadata has no {name}")
+    episodes = list(minari.load_dataset(dataset_id).iterate_episodes())
     if not episodes:
-        raise DatasetError(f"Minari dataset {dataset_id!r} holds no episode")
+        raise DatasetError("it holds no episode")
+    return metadata, episodes
+
+
+def _arrays(episodes: list[Any]) -> dict[str, Any]:
+    """Minari's episodes as the named arrays of :class:`Demonstrations`."""
 
     def info(name: str, default: int) -> Any:
         return np.array([int(e.infos[name][0]) if name in (e.infos or {}) else default for e in episodes])
+
+    def costs(episode: Any) -> Any:
+        known = "cost" in (episode.infos or {})
+        return episode.infos["cost"][1:] if known else np.full(len(episode.actions), np.nan)
 
     lengths = [len(e.actions) for e in episodes]
     arrays: dict[str, Any] = {
         "actions": np.concatenate([e.actions for e in episodes]).astype(np.float64),
         "rewards": np.concatenate([e.rewards for e in episodes]).astype(np.float64),
-        "costs": np.concatenate(
-            [
-                e.infos["cost"][1:] if "cost" in (e.infos or {}) else np.full(len(e.actions), np.nan)
-                for e in episodes
-            ]
-        ).astype(np.float64),
+        "costs": np.concatenate([costs(e) for e in episodes]).astype(np.float64),
         "offsets": np.concatenate(([0], np.cumsum(lengths))).astype(np.int64),
         "seeds": info(_SEED, -1).astype(np.int64),
         "expert": info(_EXPERT, 0).astype(np.int64),
@@ -129,9 +151,9 @@ def load(dataset_id: str, env_id: str) -> Demonstrations:
     for key in OBSERVATIONS:
         arrays[f"observations.{key}"] = np.concatenate([e.observations[key][:-1] for e in episodes])
         arrays[f"final.{key}"] = np.stack([e.observations[key][-1] for e in episodes])
-    card = {
-        "source": f"minari:{dataset_id}",
-        "episodes": len(episodes),
-        "transitions": sum(lengths),
-    }
-    return from_arrays(env_id, arrays, card)
+    return arrays
+
+
+def _card(dataset_id: str, episodes: list[Any]) -> dict[str, Any]:
+    transitions = sum(len(e.actions) for e in episodes)
+    return {"source": f"minari:{dataset_id}", "episodes": len(episodes), "transitions": transitions}

@@ -10,6 +10,7 @@ from typing import Any
 
 from rise_agents.agent import nearest
 from rise_envs import STAND_INS
+from rise_envs.streams import checked_seed
 from rise_envs.task import task_of
 
 EXPERTS: dict[tuple[str, str], str] = {
@@ -46,7 +47,7 @@ def make_expert(name: str, env_id: str, seed: int = 0, **kwargs: Any) -> Any:
         **kwargs: of the environment's description, as for ``gymnasium.make`` (say ``n_obstacles=3``).
 
     Raises:
-        ValueError: unknown name or environment.
+        ValueError: unknown name or environment, or a seed that is no whole number ≥ 0.
     """
     names = expert_names(env_id)
     if name not in names:
@@ -56,4 +57,4 @@ def make_expert(name: str, env_id: str, seed: int = 0, **kwargs: Any) -> Any:
     # A mixture lists the experts that it draws from.
     experts = [make_expert(member, env_id, seed, **kwargs) for member in getattr(kind, "names", ())]
     given = {"experts": experts} if experts else {}
-    return kind(task_of(env_id, **kwargs), seed=seed, **given)
+    return kind(task_of(env_id, **kwargs), seed=checked_seed(seed), **given)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rise_agents.agent import State, initial_state, merge_states
-from rise_agents.readings import as_batch
+from rise_agents.readings import checked_batch
 from rise_envs import streams
 from rise_envs.task import Task
 
@@ -68,7 +68,7 @@ class Mixture:
         Raises:
             ValueError: an expert returns a state but has no ``initial_state`` that says how it begins.
         """
-        rows, single = as_batch(observation)
+        rows, single = checked_batch(self.task, observation)
         batch = len(rows["desired_goal"])
         state, starts = self._begin(state, episode_start, batch)
         choice, keys, steps, *memory = state

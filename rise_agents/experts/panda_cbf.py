@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from rise_agents.experts.panda_model import DT, Scene, look, make_arm
 from rise_agents.experts.panda_steering import Steering, choose_side, make_program, steer
-from rise_agents.readings import as_batch
+from rise_agents.readings import checked_batch
+from rise_envs.settings import check_fields
 from rise_envs.task import Task
 
 Array = NDArray[np.float64]
@@ -34,6 +35,7 @@ class Config:
 
 def check_steering(steering: Steering) -> None:
     """Raise ``ValueError`` for settings that make no sense."""
+    check_fields(Steering, steering._asdict())
     if not 0.0 < steering.decay <= 1.0:
         raise ValueError(f"Steering.decay must be in (0, 1], got {steering.decay!r}")
     if not steering.turn_near < steering.turn_far:
@@ -75,7 +77,7 @@ class PandaCBF:
         deterministic: bool = True,
     ) -> tuple[Array, None]:
         """Actions, (3,) or (B, 3), and None: the expert keeps no state."""
-        rows, single = as_batch(observation)
+        rows, single = checked_batch(self.task, observation)
         own, goal, reading = packed(rows)
         action = np.empty((len(goal), 3))
         _act(own, goal, reading, self.config.steering, action)

@@ -22,8 +22,9 @@ from numpy.typing import NDArray
 from rise_agents.experts.panda_cbf import check_steering, packed
 from rise_agents.experts.panda_model import DT, Arm, Scene, advance, look, make_arm
 from rise_agents.experts.panda_steering import Steering, choose_side, make_program
-from rise_agents.readings import as_batch
+from rise_agents.readings import checked_batch
 from rise_envs import streams
+from rise_envs.settings import check_fields
 from rise_envs.task import Task
 
 Array = NDArray[np.float64]
@@ -67,6 +68,8 @@ class Config:
     rounds: int = 2
 
     def __post_init__(self) -> None:
+        check_fields(type(self), vars(self))
+        check_fields(Search, self.search._asdict())
         check_steering(self.steering)
         if not 0 < self.search.elites <= self.samples or self.rounds < 1:
             raise ValueError(f"panda_mpc.Config needs 0 < elites <= samples and rounds >= 1, got {self!r}")
@@ -190,7 +193,7 @@ class PandaMPC:
         deterministic: bool = True,
     ) -> tuple[Array, None]:
         """Actions, (3,) or (B, 3), and None: the expert keeps no state."""
-        rows, single = as_batch(observation)
+        rows, single = checked_batch(self.task, observation)
         own, goal, reading = packed(rows)
         action = np.empty((len(goal), 3))
         _act(own, goal, reading, self.config.steering, self.config.search, self._table, action)

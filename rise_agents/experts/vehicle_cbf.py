@@ -32,8 +32,9 @@ from numpy.typing import NDArray
 
 from rise_agents.experts.planar_qp import nearest_point
 from rise_agents.experts.vehicle_guidance import Discs, Guidance, direction, dot, unit
-from rise_agents.readings import as_batch
+from rise_agents.readings import checked_batch
 from rise_envs.ground_vehicle import Params
+from rise_envs.settings import check_fields
 from rise_envs.task import Task
 
 Array = NDArray[np.float64]
@@ -64,6 +65,7 @@ class Config:
     guidance: Guidance = field(default_factory=Guidance)
 
     def __post_init__(self) -> None:
+        check_fields(type(self), vars(self))
         for name in ("look_ahead", "gamma", "turn_gain", "turn_weight", "omega_max"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"vehicle_cbf.Config.{name} must be positive, got {getattr(self, name)!r}")
@@ -91,7 +93,7 @@ class VehicleCBF:
         deterministic: bool = True,
     ) -> tuple[Array, None]:
         """Actions (v, ω), (2,) or (B, 2), and None: the expert keeps no state."""
-        rows, single = as_batch(observation)
+        rows, single = checked_batch(self.task, observation)
         state, discs = rows["observation"], self.read(rows)
         action = self.filtered(state, discs, self.nominal(state, rows["desired_goal"], discs))
         return (action[0] if single else action), None

@@ -15,6 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from rise_envs.settings import check_fields
+
 Array = NDArray[np.float64]
 
 
@@ -37,6 +39,7 @@ class Guidance:
     foresight: float = 0.3
 
     def __post_init__(self) -> None:
+        check_fields(type(self), vars(self))
         for name, value in vars(self).items():
             if not value >= 0 or (name == "softness" and value == 0):
                 raise ValueError(f"Guidance.{name} must be positive, got {value!r}")

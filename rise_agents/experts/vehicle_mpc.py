@@ -31,8 +31,9 @@ from numpy.typing import NDArray
 
 from rise_agents.experts import vehicle_cbf
 from rise_agents.experts.vehicle_guidance import Discs
-from rise_agents.readings import as_batch
+from rise_agents.readings import checked_batch
 from rise_envs.geometry import unicycle
+from rise_envs.settings import check_fields
 from rise_envs.task import Task
 
 Array = NDArray[np.float64]
@@ -63,6 +64,7 @@ class Config:
     cbf: vehicle_cbf.Config = field(default_factory=vehicle_cbf.Config)
 
     def __post_init__(self) -> None:
+        check_fields(type(self), vars(self))
         for name in ("steps", "slack_weight", "tolerance", "max_iterations"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"vehicle_mpc.Config.{name} must be positive, got {getattr(self, name)!r}")
@@ -89,7 +91,7 @@ class VehicleMPC:
         deterministic: bool = True,
     ) -> tuple[Array, None]:
         """Actions (v, ω), (2,) or (B, 2), and None: every step is planned afresh."""
-        rows, single = as_batch(observation)
+        rows, single = checked_batch(self.task, observation)
         discs = self.cbf.read(rows)
         guess = self.rollout(rows["observation"], rows["desired_goal"], discs)
         action = self.cbf.filtered(rows["observation"], discs, guess[:, 0, 3:5])
