@@ -75,6 +75,11 @@ class Block:
         atomic_write_text(path, self.replaced(self.check(path), content))
 
 
+SPEED = Block("speed", "make speed")
+FIDELITY = Block("fidelity", "python -m benchmarks.fidelity")
+FAULTS = Block("faults", "make faults")
+
+
 def markdown_table(header: Sequence[str], rules: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
     """A table; ``rules`` are the cells of the line below the header."""
     return "\n".join(f"| {' | '.join(cells)} |" for cells in (header, rules, *lines))

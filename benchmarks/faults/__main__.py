@@ -64,8 +64,8 @@ def share_of(arguments: argparse.Namespace) -> float:
 
 def chosen(arguments: argparse.Namespace) -> list[str]:
     """The names of the rows to try; raises ``ValueError`` for arguments that make no sense."""
-    from benchmarks.faults.page import BLOCK
     from benchmarks.faults.rows import ROWS
+    from benchmarks.pages import FAULTS
 
     for name in arguments.rows or ():
         if name not in ROWS:
@@ -78,7 +78,7 @@ def chosen(arguments: argparse.Namespace) -> list[str]:
     if arguments.only is not None and (arguments.only < 0 or len(names) != 1):
         raise ValueError("--only takes the number of a trial, from 0 on, of the one row that --rows names")
     if arguments.docs:
-        BLOCK.check(arguments.docs)
+        FAULTS.check(arguments.docs)
     return names
 
 

@@ -11,9 +11,8 @@ from rich.table import Table
 
 from benchmarks.faults.measure import Result
 from benchmarks.faults.rows import ROWS
-from benchmarks.pages import Block, markdown_table
+from benchmarks.pages import markdown_table
 
-BLOCK = Block("faults", "make faults")
 _COLUMNS = ("", "Trials", "Looked for", "Found", "Target", "Met")
 
 

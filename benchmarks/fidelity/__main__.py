@@ -97,9 +97,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         if arguments.episodes < 3:
             raise ValueError(f"--episodes must be at least 3, got {arguments.episodes}")
         if arguments.docs:
-            from benchmarks.fidelity.page import BLOCK
+            from benchmarks.pages import FIDELITY
 
-            BLOCK.check(arguments.docs)
+            FIDELITY.check(arguments.docs)
         out: Path = arguments.out
         prepare_folder(out)
         warnings.simplefilter("ignore", DeprecationWarning)  # of libraries; their users cannot act on them

@@ -12,11 +12,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.fidelity.measure import Loops, Paths
-from benchmarks.pages import Block, markdown_table
+from benchmarks.pages import markdown_table
 from benchmarks.plots import GRID, INK
 from benchmarks.results import atomic_write_text
 
-BLOCK = Block("fidelity", "python -m benchmarks.fidelity")
 TITLES = {
     "random": "random, away from the table",
     "table": "random, on the table",

@@ -53,11 +53,11 @@ def parser() -> Parser:
 
 def chosen(arguments: argparse.Namespace) -> list[str]:
     """The names of the rows to measure; raises ``ValueError`` for an unknown one, or a page without block."""
-    from benchmarks.speed.page import BLOCK
+    from benchmarks.pages import SPEED
     from benchmarks.speed.rows import ROWS
 
     if arguments.docs:
-        BLOCK.check(arguments.docs)
+        SPEED.check(arguments.docs)
     if arguments.repeats < 1:
         raise ValueError(f"--repeats must be at least 1, got {arguments.repeats}")
     known = [*ROWS, THROUGHPUT]

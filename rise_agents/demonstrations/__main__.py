@@ -76,7 +76,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     console = Console(stderr=True)
     try:
         a = checked(argv)
-    except ValueError as error:
+    except (ValueError, OSError) as error:  # OSError: of a path that no system takes
         print(f"rise_agents.demonstrations: {error}", file=sys.stderr)
         return 2
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
