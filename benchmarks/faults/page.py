@@ -11,8 +11,9 @@ from rich.table import Table
 
 from benchmarks.faults.measure import Result
 from benchmarks.faults.rows import ROWS
-from benchmarks.pages import markdown_table
+from benchmarks.pages import FAULTS, markdown_table
 
+BLOCK = FAULTS
 _COLUMNS = ("", "Trials", "Looked for", "Found", "Target", "Met")
 
 

@@ -12,10 +12,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.fidelity.measure import Loops, Paths
-from benchmarks.pages import markdown_table
+from benchmarks.pages import FIDELITY, markdown_table
 from benchmarks.plots import GRID, INK
 from benchmarks.results import atomic_write_text
 
+BLOCK = FIDELITY
 TITLES = {
     "random": "random, away from the table",
     "table": "random, on the table",

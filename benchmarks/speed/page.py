@@ -10,11 +10,11 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.pages import SPEED as BLOCK
-from benchmarks.pages import markdown_table
+from benchmarks.pages import SPEED, markdown_table
 from benchmarks.speed.measure import Result
 from benchmarks.speed.rows import ROWS
 
+BLOCK = SPEED
 _COLUMNS = ("", "Ours", "Peer", "", "Ratio [quartiles]", "Target", "Met")
 
 
