@@ -13,10 +13,9 @@ from benchmarks.faults.measure import Effort, Fault, Findings, Tell, Unavailable
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("rise_envs", "rise_agents", "benchmarks")
-# Tests of compiled functions. Without the compiler they run in Python, where their lines can be seen; there is no
-# other honest way to count them.
-COMPILED = ("tests/test_vehicle_backends.py", "tests/test_panda_kinematics.py", "tests/test_panda_experts.py",
-            "tests/test_panda_motion.py", "tests/test_safe_panda_kinematic.py")  # fmt: skip
+# Tests of compiled functions that can do without the compiler: in Python their lines can be seen, and there is no other
+# honest way to count them. The arm's are built on pointers, which only compiled code has: they count as missed.
+COMPILED = ("tests/test_vehicle_backends.py", "tests/test_ground_vehicle.py")
 _PATIENCE = 3_600.0  # s
 
 
@@ -25,9 +24,10 @@ def measured(
 ) -> int:
     """Run tests under coverage; returns pytest's exit code."""
     environment = {**os.environ, "COVERAGE_FILE": str(place / ".coverage")}
+    command = [sys.executable, "-m", "coverage", "run", f"--rcfile={root / 'pyproject.toml'}", "-m", "pytest"]
     if not compiler:
         environment["NUMBA_DISABLE_JIT"] = "1"
-    command = [sys.executable, "-m", "coverage", "run", f"--rcfile={root / 'pyproject.toml'}", "-m", "pytest"]
+        tests = ["-W", "ignore::RuntimeWarning", *tests]  # whole numbers wrap around, as they are meant to
     options = ["-q", "-p", "no:cacheprovider", *(["-n", str(workers)] if workers > 1 else [])]
     with (place / "log").open("ab") as log:
         done = subprocess.run(  # noqa: S603
