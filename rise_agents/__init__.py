@@ -50,7 +50,7 @@ def make_agent(
     Raises:
         ValueError: an unknown agent or setting, a setting out of range, or a seed that is no whole number ≥ 0.
     """
-    return agent_class(name)(env_id, {} if config is None else config, checked_seed(seed), device)
+    return agent_class(name)(env_id, {} if config is None else config, _seed(seed), device)
 
 
 def load_agent(path: str | os.PathLike[str], env_id: str | None = None, device: str = "cpu") -> Agent:
@@ -70,7 +70,16 @@ def load_agent(path: str | os.PathLike[str], env_id: str | None = None, device: 
             path, f"was trained on {env!r}, not {env_id!r}", "train on that environment"
         )
     try:
+        _seed(description["seed"])
         return agent_class(name).from_checkpoint(arrays, description, device)
     except Exception as error:  # a right digest says who wrote a file, not that it makes sense
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise checkpoint.CheckpointError(path, f"is no whole agent ({reason})", "train it again") from None
+
+
+def _seed(seed: Any) -> int:
+    """A seed that torch's generators take; raises ``ValueError`` for anything else."""
+    whole = checked_seed(seed)
+    if whole >= 1 << 63:
+        raise ValueError(f"a seed must be below 2**63, got {whole}")
+    return whole

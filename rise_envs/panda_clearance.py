@@ -16,8 +16,7 @@ _K = panda.N_CAPSULES
 
 def _in_frame_7() -> tuple[np.ndarray, np.ndarray]:
     """Starts and edges of the capsules, those of frame 8 as seen from frame 7: the lanes have no frame 8."""
-    rotation, position = np.empty((panda.N_FRAMES, 3, 3)), np.empty((panda.N_FRAMES, 3))
-    panda.write_frames.py_func(panda.NEUTRAL, rotation, position)
+    rotation, position = panda.neutral_frames()
     turn = rotation[N].T @ rotation[panda.HAND]
     shift = rotation[N].T @ (position[panda.HAND] - position[N])
     hand = (panda.CAPSULE_FRAME == panda.HAND)[:, None]

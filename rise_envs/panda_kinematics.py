@@ -113,6 +113,16 @@ def write_frames(q: Array, rotation: Array, position: Array) -> None:
         rotation[HAND, r, 2] = z
 
 
+def neutral_frames() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rotations (F, 3, 3) and origins (F, 3) of all frames in the neutral pose."""
+    rotation, position = np.empty((N_FRAMES, 3, 3)), np.empty((N_FRAMES, 3))
+    write = getattr(
+        write_frames, "py_func", write_frames
+    )  # once, when modules are imported: not worth compiling
+    write(NEUTRAL, rotation, position)
+    return rotation, position
+
+
 @njit(cache=True)
 def write_hand(rotation: Array, position: Array, hand: Array) -> None:
     """The hand point of an arm with the given frames, in place: ``hand`` (3,)."""

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numba import carray, from_dtype, njit, types
+from numba import carray, config, from_dtype, njit, types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
@@ -75,6 +75,13 @@ def _pointer(context: Any, address: Any) -> Any:
 def fixed(array: Lanes, shape: tuple[int, ...]) -> Lanes:
     """The same contiguous array with a shape that the compiler knows; it must be the array's own."""
     return carray(_pointer(array.ctypes.data), shape)  # type: ignore[call-arg]
+
+
+if config.DISABLE_JIT:  # pointers are for compiled code only
+
+    def fixed(array: Lanes, shape: tuple[int, ...]) -> Lanes:
+        """The same array."""
+        return array
 
 
 @lane

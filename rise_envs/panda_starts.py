@@ -72,8 +72,7 @@ def constants(p: Params) -> Constants:
 
 def _neutral_capsules() -> Array:
     """Start, edge and radius of the capsules in the neutral pose, (K, 7)."""
-    rotation, position = np.empty((panda.N_FRAMES, 3, 3)), np.empty((panda.N_FRAMES, 3))
-    panda.write_frames.py_func(panda.NEUTRAL, rotation, position)
+    rotation, position = panda.neutral_frames()
     turn, frame = rotation[panda.CAPSULE_FRAME], panda.CAPSULE_FRAME
     start = position[frame] + np.einsum("kij,kj->ki", turn, panda.CAPSULE_START)
     edge = np.einsum("kij,kj->ki", turn, panda.CAPSULE_EDGE)

@@ -1,4 +1,4 @@
-"""Compiled functions do what their Python says: the same episodes, to the last bit, without the compiler."""
+"""Compiled functions do what their Python says: the same episodes without the compiler."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ import os
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
-# A few steps of a small batch, and their sum of everything shown, to the last bit.
+# A few steps of a small batch; all that is shown, number by number.
 _SCRIPT = """
 import json, sys, warnings
 import gymnasium as gym, numpy as np
@@ -20,23 +21,31 @@ observation, _ = envs.reset(seed=[1, 2, 3])
 rng = np.random.default_rng(0)
 space = envs.single_action_space
 shown = [observation["observation"], observation["obstacle"]]
-for _ in range(int(sys.argv[2])):
+for _ in range(4):
     action = space.low + rng.random((3, *space.shape)) * (space.high - space.low)
     observation, reward, *_, info = envs.step(action.astype(space.dtype))
-    shown += [observation["observation"], observation["obstacle"], reward, info["cost"]]
+    shown += [observation["observation"], observation["obstacle"], reward, info["cost"], info["clearance"]]
 print(json.dumps([float(x).hex() for part in shown for x in np.ravel(part)]))
 """
 
 
-# Not the arm: it is built on pointers, which only compiled code has.
-@pytest.mark.parametrize("env_id", ["RISE-GroundVehicle-v0"])
-def test_compiled_and_interpreted_episodes_have_the_same_bits(env_id):
+@pytest.mark.parametrize(
+    ("env_id", "tolerance"),
+    [
+        ("RISE-GroundVehicle-v0", 0.0),
+        # Its lanes count in single precision, and the compiler may put their sums in another order.
+        ("RISE-SafePandaKinematic-v0", 2e-5),
+    ],
+)
+def test_compiled_and_interpreted_episodes_are_the_same(env_id, tolerance):
     shown = []
     for off in ("0", "1"):
-        command = [sys.executable, "-c", _SCRIPT, env_id, "3"]
         done = subprocess.run(
-            command, capture_output=True, text=True, env={**os.environ, "NUMBA_DISABLE_JIT": off}
+            [sys.executable, "-c", _SCRIPT, env_id],
+            capture_output=True,
+            text=True,
+            env={**os.environ, "NUMBA_DISABLE_JIT": off},
         )
         assert done.returncode == 0, done.stderr
-        shown.append(json.loads(done.stdout))
-    assert shown[0] == shown[1]
+        shown.append([float.fromhex(x) for x in json.loads(done.stdout)])
+    np.testing.assert_allclose(shown[0], shown[1], rtol=0, atol=tolerance)

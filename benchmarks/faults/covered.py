@@ -13,8 +13,8 @@ from benchmarks.faults.measure import Effort, Fault, Findings, Tell, Unavailable
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("rise_envs", "rise_agents", "benchmarks")
-# Tests of compiled functions that can do without the compiler: in Python their lines can be seen, and there is no other
-# honest way to count them. The arm's are built on pointers, which only compiled code has: they count as missed.
+# Tests of compiled functions, once more without the compiler: in Python their lines can be seen, and there is no other
+# honest way to count them.
 COMPILED = ("tests/test_vehicle_backends.py", "tests/test_ground_vehicle.py")
 _PATIENCE = 3_600.0  # s
 

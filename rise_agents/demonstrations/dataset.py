@@ -29,6 +29,11 @@ NUMBERS = {
     **dict.fromkeys(("actions", "rewards", "costs"), np.float64),
     **dict.fromkeys(("offsets", "seeds", "expert"), np.int64),
 }
+# What a card may say, beside the environment.
+KNOWN = (
+    *("expert", "experts", "seed", "split", "params", "episodes", "transitions", "tried", "rejection_rate"),
+    *("versions", "source", "note"),
+)
 OBSERVATIONS = ("observation", "achieved_goal", "desired_goal", "obstacle")
 
 
@@ -113,9 +118,9 @@ class Demonstrations:
     def save(self, folder: str | os.PathLike[str]) -> None:
         """Store the set, whole or not at all."""
         card = {**self.card, "env": self.env_id}
-        text = json.dumps(card, indent=2, sort_keys=True) + "\n"
-        replace_file(Path(folder) / CARD, text.encode())  # first: a folder with the data is complete
         archive.write(Path(folder) / DATA, KIND, self.arrays(), card)
+        text = json.dumps(card, indent=2, sort_keys=True) + "\n"
+        replace_file(Path(folder) / CARD, text.encode())  # last: it is only a copy
 
 
 def load(folder: str | os.PathLike[str]) -> Demonstrations:
@@ -164,9 +169,7 @@ def check(d: Demonstrations) -> None:
     # Looked up by name in our registry: what a file says of an environment is compared, never built.
     if not isinstance(d.env_id, str) or d.env_id not in rise_envs.ENVS:
         raise DatasetError(f"unknown environment {d.env_id!r}, known: {', '.join(rise_envs.ENVS)}")
-    claimed, here = d.card.get("params"), params_of(d.env_id)
-    if claimed is not None and claimed != here:
-        raise DatasetError(f"was recorded in {d.env_id} with {claimed}, here it has {here}")
+    _check_card(d)
     _check_episodes(d)
     env = env_class(d.env_id)()
     try:
@@ -182,6 +185,21 @@ def check(d: Demonstrations) -> None:
             raise DatasetError(f"episode {np.argmin(last)} does not end at its goal")
     finally:
         env.close()
+
+
+def _check_card(d: Demonstrations) -> None:
+    """That the card tells the truth where that can be known, and nothing that we would not understand."""
+    for name in d.card:
+        if name not in KNOWN:
+            raise DatasetError(f"the card says {name!r}, which means nothing here; known: {', '.join(KNOWN)}")
+    for name, true in (
+        ("params", params_of(d.env_id)),
+        ("episodes", len(d)),
+        ("transitions", len(d.actions)),
+    ):
+        claimed = d.card.get(name, true)
+        if type(claimed) is not type(true) or claimed != true:
+            raise DatasetError(f"was recorded with {name} {claimed!r}, here there are {true!r}")
 
 
 def _check_episodes(d: Demonstrations) -> None:
