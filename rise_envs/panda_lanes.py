@@ -72,16 +72,18 @@ def _pointer(context: Any, address: Any) -> Any:
 
 
 @njit(inline="always")
-def fixed(array: Lanes, shape: tuple[int, ...]) -> Lanes:
+def _fixed(array: Lanes, shape: tuple[int, ...]) -> Lanes:
     """The same contiguous array with a shape that the compiler knows; it must be the array's own."""
     return carray(_pointer(array.ctypes.data), shape)  # type: ignore[call-arg]
 
 
-if config.DISABLE_JIT:  # pointers are for compiled code only
+def _as_it_is(array: Lanes, shape: tuple[int, ...]) -> Lanes:
+    """The same array."""
+    return array
 
-    def fixed(array: Lanes, shape: tuple[int, ...]) -> Lanes:
-        """The same array."""
-        return array
+
+# Pointers are for compiled code only.
+fixed = _as_it_is if config.DISABLE_JIT else _fixed  # type: ignore[attr-defined]
 
 
 @lane

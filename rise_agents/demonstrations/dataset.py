@@ -169,8 +169,8 @@ def check(d: Demonstrations) -> None:
     # Looked up by name in our registry: what a file says of an environment is compared, never built.
     if not isinstance(d.env_id, str) or d.env_id not in rise_envs.ENVS:
         raise DatasetError(f"unknown environment {d.env_id!r}, known: {', '.join(rise_envs.ENVS)}")
-    _check_card(d)
     _check_episodes(d)
+    _check_card(d)
     env = env_class(d.env_id)()
     try:
         for key in OBSERVATIONS:
