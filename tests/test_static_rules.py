@@ -38,7 +38,7 @@ KEYWORDS = {"allow_pickle": False, "weights_only": True, "trust_remote_code": Fa
 # Whose load() reads numbers, texts or our own formats. Any other one is suspect: those of stable-baselines3 unpickle.
 LOADERS = {
     *{"json", "tomllib", "numpy", "safetensors.numpy"},
-    *{"rise_agents.checkpoint", "rise_agents.demonstrations"},
+    *{"rise_agents.checkpoint", "rise_agents.demonstrations", "rise_agents.demonstrations.minari_io"},
 }
 
 
