@@ -5,12 +5,13 @@ BIN     = $(VENV)/bin
 STAMP   = $(VENV)/.installed
 ARGS   ?=
 
-.PHONY: bench speed faults coverage test test-slow smoke lint audit format clean help
+.PHONY: bench speed faults faults-quick coverage test test-slow smoke lint audit format clean help
 
 help:
 	@echo "make bench      install, then demonstrations, training, 1,000 noisy scenarios, tables, figures, videos"
 	@echo "make speed      speed against the peers, into docs/performance.md"
-	@echo "make faults     try to break the suite, into docs/reliability.md: hours"
+	@echo "make faults     try to break the suite, into docs/reliability.md: about an hour"
+	@echo "make faults-quick  a fiftieth of it"
 	@echo "make coverage   what the fast tests reach"
 	@echo "make test       install, then all fast tests"
 	@echo "make test-slow  the tests that take minutes"
@@ -36,6 +37,10 @@ speed: $(STAMP)
 
 faults: $(STAMP)
 	$(BIN)/python -m benchmarks.faults --docs docs/reliability.md $(ARGS)
+
+faults-quick: $(STAMP)
+	$(BIN)/python -m benchmarks.faults --quick --out runs/faults-quick $(ARGS) --rows \
+	  kill-run kill-checkpoint disk-full mutated-checkpoints mutated-datasets replay save-load resume-training fuzz
 
 coverage: $(STAMP)
 	$(BIN)/python -m benchmarks.faults --rows coverage --out runs/coverage $(ARGS)
