@@ -140,7 +140,7 @@ def plan_of(arguments: argparse.Namespace) -> Plan:
         seeds=arguments.seeds,
         expert=arguments.expert,
     )
-    from benchmarks.jobs import check_settings  # only now: the agents import torch, which takes a second
+    from benchmarks.jobs import check_settings  # only now: it imports all that a run needs
 
     check_settings(plan)
     _check_device(arguments.device)

@@ -8,9 +8,9 @@ import torch
 
 from rise_agents import make_agent
 from rise_agents.cloning import output_size
+from rise_agents.forward import Forward, layers_of, rescaled, standardised
 from rise_agents.networks import FirstLinear, mlp
 from rise_agents.stages import to_arrays
-from rise_agents.training import Forward, layers_of, rescaled, standardised
 
 VEHICLE = "RISE-GroundVehicle-v0"
 
