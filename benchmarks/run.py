@@ -16,8 +16,11 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.protocol import PRESETS, Plan, make_plan
+from rise_agents.agent import nearest
 from rise_agents.cli import Parser, prepare_folder
 
+# Those of torch that can train. A name that is none of them is refused without importing torch.
+_DEVICES = ("cpu", "cuda", "hpu", "mps", "mtia", "xla", "xpu")
 _EXAMPLES = """\
 examples:
   python -m benchmarks.run --agents rise pcbc cppo                    both tasks, 1,000 scenarios, about 8 minutes
@@ -140,7 +143,7 @@ def plan_of(arguments: argparse.Namespace) -> Plan:
         seeds=arguments.seeds,
         expert=arguments.expert,
     )
-    from benchmarks.jobs import check_settings  # only now: the agents import torch, which takes a second
+    from benchmarks.jobs import check_settings  # only now: it imports all that a run needs
 
     check_settings(plan)
     _check_device(arguments.device)
@@ -150,7 +153,10 @@ def plan_of(arguments: argparse.Namespace) -> Plan:
 def _check_device(device: str) -> None:
     if device == "cpu":
         return
-    import torch
+    kind, colon, index = device.partition(":")
+    if kind not in _DEVICES or (colon and not (index.isascii() and index.isdecimal())):
+        raise ValueError(f"--device {device[:40]!r} is no device: {nearest(kind, _DEVICES)}")
+    import torch  # a second or more, but only torch knows whether it can use a device
 
     try:
         torch.zeros(1, device=device)

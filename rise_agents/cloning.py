@@ -9,23 +9,26 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
 
 from rise_agents import checkpoint, readings
 from rise_agents.agent import Progress, config_to_dict, require, require_widths
 from rise_agents.demonstrations import Demonstrations
 from rise_agents.files import StrPath
+from rise_agents.forward import Layer, rescaled
 from rise_agents.readings import Standardiser
 from rise_agents.resume import Resume
-from rise_agents.stages import Stages
-from rise_agents.training import Layer, rescaled
 from rise_agents.workers import keep_freed_memory
 from rise_envs.task import Task, env_class, task_of
+
+if TYPE_CHECKING:  # who only acts need not spend the second that importing torch takes
+    import torch
+    from torch import Tensor
+
+    from rise_agents.stages import Stages
 
 LOSSES = ("mse", "nll")
 
@@ -171,9 +174,17 @@ class Lesson:
     stages: Stages
     progress: Progress
 
+    def normal(self, *shape: int) -> Tensor:
+        """Standard normal draws on the training device."""
+        return self.data.reading.new_empty(shape).normal_(generator=self.generator)
+
 
 def begin(agent: Any, source: Any, progress: Progress, resume: Resume | StrPath | None) -> Lesson:
     """The arguments of ``agent.learn``, checked and prepared."""
+    import torch  # here and not above: see there
+
+    from rise_agents.stages import Stages
+
     c = agent.config
     demonstrations = check_source(source, agent.env_id, agent.name, c.transitions)
     kept = Resume.of(resume)
@@ -208,6 +219,8 @@ def output_size(actions: int, kind: str) -> int:
 
 def seeded(seed: int, device: str) -> torch.Generator:
     """A generator on the training device; also seeds the initial weights of modules made from here on."""
+    import torch
+
     keep_freed_memory()
     torch.manual_seed(seed)
     torch.set_num_threads(1)  # a second thread makes networks of this size slower, not faster
@@ -248,26 +261,18 @@ def input_widths(agent: Any) -> tuple[int, int]:
     return robot.shape[1], reading.shape[1]
 
 
-def check_arrays(
-    agent: Any,
-    arrays: dict[str, NDArray],
-    modules: Mapping[str, nn.Module],
-    extra: Mapping[str, tuple[int, ...]] | None = None,
-) -> None:
-    """Raise ``ValueError`` unless ``arrays`` are those of a cloned agent with these modules.
+def check_arrays(agent: Any, arrays: dict[str, NDArray], shapes: Mapping[str, tuple[int, ...]]) -> None:
+    """Raise ``ValueError`` unless ``arrays`` are those of a cloned agent.
 
     Args:
         agent: with its config.
         arrays: as they were stored.
-        modules: by the names under which they are stored; untrained, only their shapes are read.
-        extra: shapes of what else is stored, by name.
+        shapes: of what it stores beside its eyes, by name.
     """
-    shapes: dict[str, tuple[int, ...]] = dict(extra or {})
+    expected = dict(shapes)
     for part, width in zip(("robot", "reading"), input_widths(agent), strict=True):
-        shapes |= {f"eyes.{part}.{what}": (width,) for what in ("mean", "scale")}
-    for name, module in modules.items():
-        shapes |= {f"{name}.{key}": tuple(value.shape) for key, value in module.state_dict().items()}
-    checkpoint.expect(arrays, shapes)
+        expected |= {f"eyes.{part}.{what}": (width,) for what in ("mean", "scale")}
+    checkpoint.expect(arrays, expected)
     for name in ("eyes.robot.scale", "eyes.reading.scale"):
         require(bool((arrays[name] > 0).all()), f"{name} must be positive", arrays[name])
 

@@ -13,17 +13,15 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
-import torch
 from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
-from stable_baselines3.common.logger import Logger
 
-from rise_agents import checkpoint, readings
+from rise_agents import checkpoint, readings, shapes
 from rise_agents.actor import Actor
 from rise_agents.agent import (
     Progress,
@@ -39,19 +37,16 @@ from rise_agents.agent import (
 from rise_agents.cloning import make_task
 from rise_agents.cppo_config import Config
 from rise_agents.files import StrPath
-from rise_agents.lagrangian import ConstrainedPPO, stored_shapes
 from rise_agents.resume import Resume
 from rise_agents.seeds import episode_seeds
-from rise_agents.vec_env import (
-    Bridge,
-    action_bounds,
-    as_vector_env,
-    make_training_env,
-    random_inputs,
-)
+from rise_agents.vec_env import action_bounds, as_vector_env, make_training_env, random_inputs
 from rise_agents.workers import keep_freed_memory
 from rise_envs import ENVS
 from rise_envs.task import Task
+
+if TYPE_CHECKING:  # who only acts need not spend the second that importing torch and SB3 takes
+    from rise_agents.bridge import Bridge
+    from rise_agents.constrained_ppo import ConstrainedPPO
 
 _STATISTICS_SAMPLES = 2048  # observations that the units of the inputs are taken from
 
@@ -140,6 +135,8 @@ class CPPO:
             venv.close()
 
     def _learn(self, venv: VectorEnv, progress: Progress, kept: Resume, source: str) -> CPPO:
+        from rise_agents.bridge import Bridge  # here and not above: see there
+
         c, bounds = self.config, action_bounds(venv.single_action_space)
         ranks = self._ranks(venv.single_observation_space)
         c.check_batch(venv.num_envs)
@@ -177,6 +174,10 @@ class CPPO:
         return readings.Standardiser.fit(random_inputs(venv, self._inputs, seeds, _STATISTICS_SAMPLES))
 
     def _trainer(self, bridge: Bridge, progress: Progress) -> ConstrainedPPO:
+        from stable_baselines3.common.logger import Logger
+
+        from rise_agents.constrained_ppo import ConstrainedPPO
+
         c = self.config
         ppo = ConstrainedPPO(
             controller=c.controller(),
@@ -298,11 +299,12 @@ class CPPO:
     def _check_arrays(self, arrays: dict[str, NDArray]) -> None:
         arrays = {name: a for name, a in arrays.items() if not name.startswith("random.")}
         inputs, outputs = len(arrays["units.mean"]), len(arrays["policy.action_net.bias"])
-        shapes: dict[str, tuple[int, ...]] = {"units.mean": (inputs,), "units.scale": (inputs,)}
+        expected: shapes.Shapes = {"units.mean": (inputs,), "units.scale": (inputs,)}
         boxes = "action.low" in arrays
         if boxes:
-            shapes |= {"action.low": (outputs,), "action.high": (outputs,)}
-        checkpoint.expect(arrays, {**shapes, **stored_shapes(inputs, outputs, self.config.hidden, boxes)})
+            expected |= {"action.low": (outputs,), "action.high": (outputs,)}
+        expected |= shapes.constrained_ppo(inputs, outputs, self.config.hidden, boxes)
+        checkpoint.expect(arrays, expected)
         require(
             bool((arrays["units.scale"] > 0).all()), "units.scale must be positive", arrays["units.scale"]
         )
@@ -338,6 +340,8 @@ def _linear(first: float, last: float) -> Callable[[float], float]:
 @contextmanager
 def _one_thread() -> Iterator[None]:
     """Networks this small lose time to a second thread; and one thread sums in one order."""
+    import torch
+
     keep_freed_memory()
     threads = torch.get_num_threads()
     torch.set_num_threads(1)

@@ -6,22 +6,21 @@ The same inputs, data, network, loss and budget as RISE, without the encoder: a 
 from __future__ import annotations
 
 import os
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
 
-from rise_agents import cloning
+from rise_agents import cloning, shapes
 from rise_agents.agent import Progress, State, make_config, silent
 from rise_agents.cloning import ActionUnits, CloningConfig, Eyes
 from rise_agents.files import StrPath
-from rise_agents.networks import mlp
+from rise_agents.forward import Forward, layers_of, standardised
 from rise_agents.readings import checked_batch
 from rise_agents.resume import Resume
-from rise_agents.stages import to_arrays
-from rise_agents.training import Forward, fit, layers_of, standardised
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
 
 Config = CloningConfig
 
@@ -50,11 +49,17 @@ class PCBC:
 
     def learn(self, source: Any, progress: Progress = silent, resume: Resume | StrPath | None = None) -> PCBC:
         """Clone :class:`rise_agents.demonstrations.Demonstrations`; see :class:`rise_agents.agent.Agent`."""
+        import torch  # here and not above: it takes a second, which who only acts need not spend
+
+        from rise_agents.networks import mlp
+        from rise_agents.stages import to_arrays
+        from rise_agents.training import fit
+
         c = self.config
         lesson = cloning.begin(self, source, progress, resume)
         data = lesson.data
         seen = torch.cat((data.robot, data.reading), -1)
-        policy = self._network(seen.shape[1]).to(self.device)
+        policy = mlp(*self._sizes(seen.shape[1])).to(self.device)
         fit(
             lesson.stages["policy"],
             policy,
@@ -68,8 +73,9 @@ class PCBC:
         )
         return self._use({**lesson.eyes.arrays(), **to_arrays(policy, "policy")})
 
-    def _network(self, inputs: int) -> nn.Module:
-        return mlp(inputs, self.config.hidden, cloning.output_size(self.units.size, self.config.loss))
+    def _sizes(self, inputs: int) -> tuple[int, tuple[int, ...], int]:
+        """Inputs, hidden widths and outputs of π(s, g, c)."""
+        return inputs, self.config.hidden, cloning.output_size(self.units.size, self.config.loss)
 
     def _use(self, arrays: dict[str, NDArray]) -> PCBC:
         self._arrays = arrays
@@ -105,9 +111,8 @@ class PCBC:
     def from_checkpoint(cls, arrays: dict[str, NDArray], description: dict[str, Any], device: str) -> PCBC:
         """The agent that :meth:`save` stored; ``ValueError`` if the arrays are not those of its config."""
         agent = cls(description["env"], description["config"], description["seed"], device)
-        with torch.device("meta"):
-            modules = {"policy": agent._network(sum(cloning.input_widths(agent)))}
-        cloning.check_arrays(agent, arrays, modules)
+        sizes = agent._sizes(sum(cloning.input_widths(agent)))
+        cloning.check_arrays(agent, arrays, shapes.mlp("policy", *sizes))
         return agent._use(arrays)
 
 

@@ -19,14 +19,12 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
 
-from rise_agents import cloning, readings
+from rise_agents import cloning, readings, shapes
 from rise_agents.agent import (
     Progress,
     State,
@@ -40,10 +38,13 @@ from rise_agents.agent import (
 from rise_agents.cloning import ActionUnits, CloningConfig, Eyes, Lesson
 from rise_agents.draws import NormalDraws
 from rise_agents.files import StrPath
-from rise_agents.networks import LOG_SIGMA_RANGE, Encoder, gaussian_kl, mlp, reparameterise
+from rise_agents.forward import LOG_SIGMA_RANGE, Forward, layers_of, standardised
 from rise_agents.resume import Resume
-from rise_agents.stages import to_arrays
-from rise_agents.training import Forward, fit, layers_of, standardised
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
+
+    from rise_agents.networks import VAE
 
 _ONE = np.uint64(1)
 _LOG_SIGMA_RANGE = tuple(np.float32(bound) for bound in LOG_SIGMA_RANGE)
@@ -79,55 +80,6 @@ class Config(CloningConfig):
             require(getattr(self, name) >= 1, f"{name} must be at least 1", getattr(self, name))
 
 
-class VAE(nn.Module):
-    """Encoder and decoder of readings; the decoder answers in units of the reading noise."""
-
-    def __init__(self, inputs: int, config: Config) -> None:
-        super().__init__()
-        self.encoder = Encoder(inputs, config.encoder_hidden, config.latent)
-        self.decoder = mlp(config.latent, config.encoder_hidden[::-1], inputs)
-
-    def loss(self, c: Tensor, target: Tensor, epsilon: Tensor, beta: float) -> dict[str, Tensor]:
-        """Negative ELBO (Algorithm 1, line 7).
-
-        Args:
-            c: readings in standard units, (B, C).
-            target: the same readings in units of the reading noise, (B, C).
-            epsilon: standard normal draws, (B, Z).
-            beta: weight of the KL term.
-        """
-        mu, log_sigma = self.encoder(c)
-        decoded = self.decoder(reparameterise(mu, log_sigma, epsilon))
-        reconstruction = 0.5 * ((decoded - target) ** 2).sum(-1).mean()
-        kl = gaussian_kl(mu, log_sigma).mean()
-        return {"loss": reconstruction + beta * kl, "reconstruction": reconstruction, "kl": kl}
-
-
-def policy_loss(
-    policy: nn.Module,
-    robot: Tensor,
-    mu: Tensor,
-    log_sigma: Tensor,
-    action: Tensor,
-    epsilon: Tensor,
-    kind: str,
-) -> dict[str, Tensor]:
-    """The loss of stage 2, averaged over M posterior samples (Algorithm 1, lines 16 to 22).
-
-    Args:
-        policy: π_θ on (s, g, z).
-        robot: (B, R).
-        mu: (B, Z), without gradient.
-        log_sigma: (B, Z), without gradient.
-        action: (B, A).
-        epsilon: standard normal draws, (M, B, Z).
-        kind: the imitation loss.
-    """
-    z = reparameterise(mu, log_sigma, epsilon)
-    output = policy(torch.cat((robot.expand(len(epsilon), *robot.shape), z), -1))
-    return {"loss": cloning.imitation_loss(output, action, kind)}
-
-
 class Rise:
     """The paper's agent.
 
@@ -153,6 +105,11 @@ class Rise:
 
     def learn(self, source: Any, progress: Progress = silent, resume: Resume | StrPath | None = None) -> Rise:
         """Algorithm 1 on :class:`rise_agents.demonstrations.Demonstrations`; see :class:`rise_agents.agent.Agent`."""
+        import torch  # here and not above: it takes a second, which who only acts need not spend
+
+        from rise_agents.networks import VAE, mlp
+        from rise_agents.stages import to_arrays
+
         c = self.config
         lesson = cloning.begin(self, source, progress, resume)
         data, eyes, tell = lesson.data, lesson.eyes, lesson.progress
@@ -164,14 +121,14 @@ class Rise:
         )
         share = c.vae_updates / (c.vae_updates + c.updates)
 
-        vae = VAE(data.reading.shape[1], c).to(self.device)
+        vae = VAE(data.reading.shape[1], c.encoder_hidden, c.latent).to(self.device)
         self._fit_vae(vae, lesson, ratio, lambda done, figures: tell(share * done, figures))
         with torch.no_grad():
             mu, log_sigma = vae.encoder(data.reading)
         # Stage 2 sees samples of the latent with unit scale, which only renames its axes. The scale is that of
         # the samples, not of their means: where the posterior falls back to the prior all means coincide.
         spread = (mu.var(0) + (2 * log_sigma).exp().mean(0)).sqrt()
-        policy = self._policy_network(data.robot.shape[1]).to(self.device)
+        policy = mlp(*self._policy_sizes(data.robot.shape[1])).to(self.device)
         self._fit_policy(
             policy,
             lesson,
@@ -182,15 +139,18 @@ class Rise:
         scale = {"vae.spread": spread.cpu().numpy(), "vae.ratio": ratio.cpu().numpy()}
         return self._use({**eyes.arrays(), **weights, **scale})
 
-    def _policy_network(self, robot: int) -> nn.Module:
+    def _policy_sizes(self, robot: int) -> tuple[int, tuple[int, ...], int]:
+        """Inputs, hidden widths and outputs of π(s, g, z)."""
         c = self.config
-        return mlp(robot + c.latent, c.hidden, cloning.output_size(self.units.size, c.loss))
+        return robot + c.latent, c.hidden, cloning.output_size(self.units.size, c.loss)
 
     def _fit_vae(self, vae: VAE, lesson: Lesson, ratio: Tensor, progress: Progress) -> None:
-        c, generator, seen = self.config, lesson.generator, lesson.data.reading
+        from rise_agents.training import fit  # which imports torch
+
+        c, seen = self.config, lesson.data.reading
 
         def loss(reading: Tensor, target: Tensor) -> dict[str, Tensor]:
-            epsilon = torch.randn((len(reading), c.latent), generator=generator, device=generator.device)
+            epsilon = lesson.normal(len(reading), c.latent)
             return vae.loss(reading, target, epsilon, c.beta)
 
         fit(
@@ -201,18 +161,20 @@ class Rise:
             updates=c.vae_updates,
             batch_size=c.vae_batch_size,
             learning_rate=c.learning_rate,
-            generator=generator,
+            generator=lesson.generator,
             progress=progress,
         )
 
     def _fit_policy(
         self, policy: nn.Module, lesson: Lesson, posterior: tuple[Tensor, Tensor], progress: Progress
     ) -> None:
-        c, generator, data = self.config, lesson.generator, lesson.data
+        from rise_agents.networks import policy_loss  # which imports torch
+        from rise_agents.training import fit
+
+        c, data = self.config, lesson.data
 
         def loss(robot: Tensor, mu: Tensor, log_sigma: Tensor, action: Tensor) -> dict[str, Tensor]:
-            shape = (c.n_samples, len(mu), c.latent)
-            epsilon = torch.randn(shape, generator=generator, device=generator.device)
+            epsilon = lesson.normal(c.n_samples, len(mu), c.latent)
             return policy_loss(policy, robot, mu, log_sigma, action, epsilon, c.loss)
 
         fit(
@@ -223,7 +185,7 @@ class Rise:
             updates=c.updates,
             batch_size=c.batch_size,
             learning_rate=c.learning_rate,
-            generator=generator,
+            generator=lesson.generator,
             progress=progress,
         )
 
@@ -300,10 +262,12 @@ class Rise:
     def from_checkpoint(cls, arrays: dict[str, NDArray], description: dict[str, Any], device: str) -> Rise:
         """The agent that :meth:`save` stored; ``ValueError`` if the arrays are not those of its config."""
         agent = cls(description["env"], description["config"], description["seed"], device)
-        robot, reading = cloning.input_widths(agent)
-        with torch.device("meta"):
-            modules = {"vae": VAE(reading, agent.config), "policy": agent._policy_network(robot)}
-        extra = {"vae.spread": (agent.config.latent,), "vae.ratio": (reading,)}
-        cloning.check_arrays(agent, arrays, modules, extra)
+        c, (robot, reading) = agent.config, cloning.input_widths(agent)
+        expected = {
+            **{"vae.spread": (c.latent,), "vae.ratio": (reading,)},
+            **shapes.vae("vae", reading, c.encoder_hidden, c.latent),
+            **shapes.mlp("policy", *agent._policy_sizes(robot)),
+        }
+        cloning.check_arrays(agent, arrays, expected)
         require(bool((arrays["vae.spread"] > 0).all()), "vae.spread must be positive", arrays["vae.spread"])
         return agent._use(arrays)

@@ -98,6 +98,31 @@ def test_store_and_load_in_a_new_process(agents, vehicle_demonstrations, name, t
         load_agent(tmp_path / "agent.rise", "RISE-SafePanda-v0")
 
 
+_ACTS = """
+import sys
+import numpy as np
+from rise_agents import load_agent, make_agent
+name, env_id, checkpoint, batch = sys.argv[1:]
+make_agent(name, env_id)
+agent = load_agent(checkpoint, env_id)
+for deterministic in (True, False):
+    agent.predict(dict(np.load(batch)), deterministic=deterministic)
+print(*{"torch", "stable_baselines3"} & set(sys.modules))
+"""
+
+
+@pytest.mark.parametrize("name", AGENTS)
+def test_only_learning_needs_torch(agents, vehicle_demonstrations, name, tmp_path):
+    """Importing it takes a second or two, which a bad setting and a process that only acts should not take."""
+    agents[name].save(tmp_path / "agent.rise")
+    np.savez(tmp_path / "batch.npz", **observations(vehicle_demonstrations))
+    arguments = [name, VEHICLE, str(tmp_path / "agent.rise"), str(tmp_path / "batch.npz")]
+    done = subprocess.run(
+        [sys.executable, "-c", _ACTS, *arguments], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == []
+
+
 @pytest.mark.parametrize("name", AGENTS)
 def test_stable_baselines_evaluates_it(agents, name):
     env = DummyVecEnv([lambda: Monitor(gym.make(VEHICLE))] * 2)

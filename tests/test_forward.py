@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from rise_agents import make_agent
+from rise_agents import make_agent, shapes
 from rise_agents.cloning import output_size
-from rise_agents.networks import FirstLinear, mlp
+from rise_agents.forward import Forward, layers_of, rescaled, standardised
+from rise_agents.networks import VAE, FirstLinear, mlp
 from rise_agents.stages import to_arrays
-from rise_agents.training import Forward, layers_of, rescaled, standardised
 
 VEHICLE = "RISE-GroundVehicle-v0"
 
@@ -31,6 +31,15 @@ def test_forward_equals_torch(hidden, rows):
     np.testing.assert_allclose(forward(x), expected, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(forward(x[:, :1], x[:, 1:]), expected, rtol=1e-5, atol=1e-5)
     assert forward(x).dtype == np.float32
+
+
+@pytest.mark.parametrize("hidden", [(8,), (16, 5), (7, 6, 5)])
+def test_shapes_are_known_without_torch(hidden):
+    for network, expected in (
+        (mlp(4, hidden, 3), shapes.mlp("net", 4, hidden, 3)),
+        (VAE(4, hidden, 2), shapes.vae("net", 4, hidden, 2)),
+    ):
+        assert {key: array.shape for key, array in to_arrays(network, "net").items()} == expected
 
 
 @pytest.mark.parametrize("shape", [(5,), (2, 5)])

@@ -13,8 +13,9 @@ from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.logger import Logger
 from toy_envs import Walk
 
-from rise_agents.lagrangian import ConstrainedPPO, Controller, constrained_advantage
-from rise_agents.vec_env import Bridge
+from rise_agents.bridge import Bridge
+from rise_agents.constrained_ppo import ConstrainedPPO
+from rise_agents.lagrangian import Controller, constrained_advantage
 
 PLAIN = Controller(limit=1.0, kp=0.5, ki=0.25, kd=2.0, delay=1, smoothing=0.0)
 

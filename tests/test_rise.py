@@ -8,8 +8,8 @@ import torch
 from torch.distributions import Independent, Normal, kl_divergence
 
 from rise_agents import cloning, make_agent
-from rise_agents.networks import Encoder, gaussian_kl, mlp, reparameterise
-from rise_agents.rise import VAE, Config, Rise, policy_loss
+from rise_agents.networks import VAE, Encoder, gaussian_kl, mlp, policy_loss, reparameterise
+from rise_agents.rise import Rise
 from rise_agents.stages import to_arrays
 
 VEHICLE = "RISE-GroundVehicle-v0"
@@ -31,7 +31,7 @@ def test_kl_equals_torch_distributions():
 def test_elbo_is_gaussian_likelihood_plus_weighted_kl():
     """Up to the constant of the normal density, the loss is −log p(c | z) + β KL with unit deviation."""
     torch.manual_seed(0)
-    vae, c, epsilon = VAE(5, Config()), torch.randn(7, 5), torch.randn(7, 5)
+    vae, c, epsilon = VAE(5, (64, 64), 5), torch.randn(7, 5), torch.randn(7, 5)
     target = 3 * c + 1
     terms = vae.loss(c, target, epsilon, beta=0.3)
     mu, log_sigma = vae.encoder(c)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import json
 import shutil
+import subprocess
+import sys
 
 import imageio.v3 as iio
 import numpy as np
@@ -138,6 +140,8 @@ def test_workers_do_not_change_the_tables(run, tmp_path):
         (["--noise-level", "1"], "did you mean '--noise-levels'"),
         (["--out", "/proc/nowhere"], "cannot write"),
         (["--device", "cuda:77"], "device"),
+        (["--device", "cudda"], "did you mean 'cuda'"),
+        (["--device", "cpu:-1"], "no device"),
     ],
 )
 def test_bad_arguments_end_in_one_line_and_exit_code_2(arguments, says, capsys, tmp_path, monkeypatch):
@@ -147,6 +151,16 @@ def test_bad_arguments_end_in_one_line_and_exit_code_2(arguments, says, capsys, 
     assert says in error
     assert error.count("\n") == 1
     assert not list(tmp_path.rglob("*"))
+
+
+@pytest.mark.parametrize("arguments", [["--set", "cppo.gama=1"], ["--device", "gpu"]])
+def test_bad_arguments_are_told_before_torch_is_imported(arguments):
+    code = (
+        "import sys; from benchmarks.run import main; code = main(sys.argv[1:]); import benchmarks.pipeline; "
+        "print(code, *{'torch', 'stable_baselines3'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True)
+    assert done.stdout == "2\n"
 
 
 def test_a_plan_adds_the_user_s_choices_to_the_preset():

@@ -167,7 +167,7 @@ def test_all_packages_are_read() -> None:
         "import stable_baselines3 as sb3\nsb3.PPO.load(path)",
         "from stable_baselines3.common.vec_env import VecNormalize\nVecNormalize.load(path, venv)",
         "from stable_baselines3.common.policies import ActorCriticPolicy\nActorCriticPolicy.load(path)",
-        "from rise_agents.lagrangian import ConstrainedPPO\nConstrainedPPO.load(path)",
+        "from rise_agents.constrained_ppo import ConstrainedPPO\nConstrainedPPO.load(path)",
         "model = make()\nmodel.load(path)",
         "type(model).load(path)",
         "import yaml\nyaml.load(text)",

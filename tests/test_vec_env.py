@@ -16,8 +16,8 @@ from toy_envs import Bandit, Walk
 
 import rise_envs  # noqa: F401
 from rise_agents import vec_env
+from rise_agents.bridge import Bridge
 from rise_agents.seeds import SPLITS
-from rise_agents.vec_env import Bridge
 
 VEHICLE = "RISE-GroundVehicle-v0"
 KEYS = ("observation", "desired_goal", "obstacle")
