@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.protocol import PRESETS, Plan, make_plan
-from rise_agents.agent import nearest
 from rise_agents.cli import Parser, prepare_folder
 
 # Those of torch that can train. A name that is none of them is refused without importing torch.
@@ -155,7 +154,7 @@ def _check_device(device: str) -> None:
         return
     kind, colon, index = device.partition(":")
     if kind not in _DEVICES or (colon and not (index.isascii() and index.isdecimal())):
-        raise ValueError(f"--device {device[:40]!r} is no device: {nearest(kind, _DEVICES)}")
+        raise ValueError(f"--device {device[:40]!r} is none of torch: known: {', '.join(_DEVICES)}")
     import torch  # a second or more, but only torch knows whether it can use a device
 
     try:

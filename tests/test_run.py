@@ -140,8 +140,8 @@ def test_workers_do_not_change_the_tables(run, tmp_path):
         (["--noise-level", "1"], "did you mean '--noise-levels'"),
         (["--out", "/proc/nowhere"], "cannot write"),
         (["--device", "cuda:77"], "device"),
-        (["--device", "cudda"], "did you mean 'cuda'"),
-        (["--device", "cpu:-1"], "no device"),
+        (["--device", "gpu"], "known: cpu, cuda"),
+        (["--device", "cpu:-1"], "known: cpu, cuda"),
     ],
 )
 def test_bad_arguments_end_in_one_line_and_exit_code_2(arguments, says, capsys, tmp_path, monkeypatch):
