@@ -7,6 +7,7 @@ writes tables, figures and videos. Run it again in the same folder and it contin
 from __future__ import annotations
 
 import argparse
+import ctypes
 import json
 import sys
 import time
@@ -149,12 +150,25 @@ def plan_of(arguments: argparse.Namespace) -> Plan:
     return plan
 
 
+def _has_gpu_driver() -> bool:
+    """Whether NVIDIA's or AMD's driver is there; torch calls both cuda."""
+    for library in ("libcuda.so.1", "nvcuda.dll"):
+        try:
+            ctypes.CDLL(library)
+        except OSError:
+            continue
+        return True
+    return Path("/dev/kfd").exists()
+
+
 def _check_device(device: str) -> None:
     if device == "cpu":
         return
     kind, colon, index = device.partition(":")
     if kind not in _DEVICES or (colon and not (index.isascii() and index.isdecimal())):
         raise ValueError(f"--device {device[:40]!r} is none of torch: known: {', '.join(_DEVICES)}")
+    if kind == "cuda" and not _has_gpu_driver():
+        raise ValueError(f"--device {device} cannot be used here: no driver of a GPU is installed")
     import torch  # a second or more, but only torch knows whether it can use a device
 
     try:
