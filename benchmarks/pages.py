@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import platform
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import astuple, dataclass, fields
 from importlib import metadata
 from pathlib import Path
@@ -124,3 +124,9 @@ def reason(error: BaseException) -> str:
     """One line that says what went wrong."""
     lines = str(error).strip().splitlines()
     return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
+
+
+def renewed(old: Sequence[Any], new: Sequence[Any], order: Iterable[str]) -> list[Any]:
+    """Results by name, the ``new`` in place of the ``old`` ones, in ``order``; those that it does not name are dropped."""
+    by_name = {each.name: each for each in (*old, *new)}
+    return [by_name[name] for name in order if name in by_name]

@@ -164,6 +164,24 @@ def test_the_command_writes_table_and_page(tmp_path, monkeypatch, capsys, faults
     assert main(["--render", "--out", str(out)]) == code  # from what is there
 
 
+def test_rows_that_are_not_tried_again_stay(tmp_path, monkeypatch):
+    """And the exit code speaks of those that were tried."""
+    found, fine = Findings(), Findings()
+    found.add(0, [Fault("late", "2 s")])
+    fine.add(0, [])
+    rows = {
+        "kill-run": replace(ROWS["kill-run"], run=lambda effort, tell: fine),
+        "fuzz": replace(ROWS["fuzz"], run=lambda effort, tell: found),
+    }
+    monkeypatch.setattr("benchmarks.faults.rows.ROWS", rows)
+    codes = [main(["--rows", name, "--out", str(tmp_path)]) for name in ("fuzz", "kill-run")]
+    assert codes == [1, 0]
+    assert [row.name for row in measure.read_csv(tmp_path / "faults.csv")] == ["kill-run", "fuzz"]
+    rows["fuzz"] = replace(ROWS["fuzz"], run=lambda effort, tell: fine)
+    assert main(["--rows", "fuzz", "--out", str(tmp_path)]) == 0
+    assert [row.met for row in measure.read_csv(tmp_path / "faults.csv")] == ["yes", "yes"]
+
+
 def test_an_interruption_is_told(tmp_path, monkeypatch):
     def run(effort, tell):
         raise KeyboardInterrupt

@@ -18,14 +18,15 @@ QUICK = 0.02
 _SHOWN = 20  # faults of a row that are printed; all are in faults.txt
 _EXAMPLES = """\
 examples:
-  python -m benchmarks.faults                                      every row in full: about two hours
+  python -m benchmarks.faults                                      every row in full: about an hour
   python -m benchmarks.faults --quick                              a fiftieth of the trials: some ten minutes
   python -m benchmarks.faults --rows mutated-checkpoints fuzz      two rows
   python -m benchmarks.faults --rows fuzz --seed 7 --only 4711     one trial again, as a fault that was found says
   python -m benchmarks.faults --docs docs/reliability.md           try everything, then renew the table of the page
   python -m benchmarks.faults --docs docs/reliability.md --render  the same from the last trials
 
-Everything happens in a temporary folder, which is kept, and named, if something was found.
+Everything happens in a temporary folder, which is kept, and named, if something was found. Rows that are tried again
+take the place of the former ones in the table; the others stay.
 """
 
 
@@ -90,10 +91,11 @@ def try_all(names: Sequence[str], share: float, arguments: argparse.Namespace) -
     from benchmarks.faults.rows import ROWS
     from benchmarks.results import atomic_write_text
 
-    results: list[measure.Result] = []
-    lines: list[str] = []
     workers = arguments.workers or available_cores()
     out: Path = arguments.out
+    table = out / "faults.csv"
+    results = measure.read_csv(table) if table.exists() else []  # other rows stay as they are
+    lines: list[str] = []
     with measure.temporary_folder(keep=lambda: bool(lines)) as folder, Display() as display:
         effort = measure.Effort(share, arguments.seed, workers, arguments.only, folder)
         for name in names:
@@ -104,18 +106,18 @@ def try_all(names: Sequence[str], share: float, arguments: argparse.Namespace) -
                 print(f"benchmarks.faults: {line}", file=sys.stderr)
             if found[_SHOWN:]:
                 print(f"benchmarks.faults: {name}: {len(found) - _SHOWN} more", file=sys.stderr)
-            results.append(result)
+            results = pages.renewed(results, [result], ROWS)
             lines += found
             # After each row: an interruption hours later loses only the row that it meets.
-            measure.write_csv(out / "faults.csv", results)
+            measure.write_csv(table, results)
             atomic_write_text(out / "faults.txt", "".join(f"{line}\n" for line in lines))
     atomic_write_text(out / "machine.txt", pages.machine() + "\n")
     if lines:
         print(f"benchmarks.faults: the files of these trials are in {folder}", file=sys.stderr)
 
 
-def render(out: Path, docs: Path | None) -> bool:
-    """Table and ``faults.md`` from the files in ``out``; whether all targets are met.
+def render(out: Path, docs: Path | None, names: Sequence[str]) -> bool:
+    """Table and ``faults.md`` from the files in ``out``; whether the targets of the rows ``names`` are met.
 
     Raises:
         ValueError: they are not there.
@@ -130,7 +132,7 @@ def render(out: Path, docs: Path | None) -> bool:
     if docs:
         page.BLOCK.update(docs, text)
     print(page.table_text(results))
-    return all(result.met != "no" for result in results)
+    return all(result.met != "no" for result in results if result.name in names)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -146,7 +148,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
             limit_threads()
             try_all(names, share, arguments)
-        met = render(arguments.out, arguments.docs)
+        met = render(arguments.out, arguments.docs, names)
     except ValueError as error:
         print(f"benchmarks.faults: {error}", file=sys.stderr)
         return 2

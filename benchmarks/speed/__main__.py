@@ -100,8 +100,10 @@ def measure_all(names: Sequence[str], arguments: argparse.Namespace, out: Path) 
                 except Exception as error:
                     results.append(measure.not_measured(row, pages.reason(error)))
                     wrong.append(f"{name}: {pages.reason(error)}")
-    if results:
-        measure.write_csv(out / "speed.csv", results)
+    table = out / "speed.csv"
+    if results:  # rows that were not measured now stay as they are
+        old = measure.read_csv(table) if table.exists() else []
+        measure.write_csv(table, pages.renewed(old, results, ROWS))
     atomic_write_text(out / "machine.txt", pages.machine() + "\n")
     return wrong
 
