@@ -127,6 +127,6 @@ def reason(error: BaseException) -> str:
 
 
 def renewed(old: Sequence[Any], new: Sequence[Any], order: Iterable[str]) -> list[Any]:
-    """Results by name, the ``new`` in place of the ``old`` ones, in ``order``; those that it does not name are dropped."""
+    """Results by name, the ``new`` in place of the ``old`` ones, in ``order``; others are dropped."""
     by_name = {each.name: each for each in (*old, *new)}
     return [by_name[name] for name in order if name in by_name]
