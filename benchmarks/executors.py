@@ -78,7 +78,7 @@ class _Schedule:
 
     def note(self, ended: Ended) -> None:
         job, reason = self.pending[ended.key], ended.error
-        if ended.died:
+        if ended.died and not job.output.exists():  # a job is done when its output is there
             self.deaths[ended.key] += 1
             died = f"its worker process ended with {ended.died}"
             if self.deaths[ended.key] < ATTEMPTS:

@@ -112,6 +112,16 @@ def training_jobs(plan: Plan, out: Path, device: str, every: float) -> list[Job]
     return jobs
 
 
+def tidy(out: Path) -> None:
+    """Remove what a kill in the last lines of a job left: states of finished trainings, pieces of finished sets."""
+    for state in out.glob("agents/*/*.training"):
+        if state.with_suffix(".rise").exists():
+            state.unlink()
+    for parts in out.glob(f"demonstrations/*/{PARTS}"):
+        if (parts.parent / demonstrations.DATA).exists():
+            shutil.rmtree(parts)
+
+
 def evaluation_jobs(plan: Plan, out: Path) -> list[Job]:
     """One job for each row, noise level and portion of the scenarios."""
     jobs = []

@@ -130,3 +130,11 @@ def renewed(old: Sequence[Any], new: Sequence[Any], order: Iterable[str]) -> lis
     """Results by name, the ``new`` in place of the ``old`` ones, in ``order``; others are dropped."""
     by_name = {each.name: each for each in (*old, *new)}
     return [by_name[name] for name in order if name in by_name]
+
+
+def known_machine(out: Path) -> str:
+    """What ``machine.txt`` in a folder of measurements says; raises ``ValueError`` if it is not there."""
+    try:
+        return (out / "machine.txt").read_text().strip()
+    except OSError as error:
+        raise ValueError(f"cannot read {out / 'machine.txt'}: {error.strerror}") from None

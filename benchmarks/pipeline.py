@@ -20,6 +20,7 @@ from benchmarks.jobs import (
     demonstrations_folder,
     evaluation_jobs,
     recording_jobs,
+    tidy,
     training_jobs,
     video_jobs,
 )
@@ -55,6 +56,7 @@ def execute(plan: Plan, out: Path, how: How) -> list[Failure]:
     """
     for folder in [out, *(path for path in out.rglob("*") if path.is_dir())]:
         sweep(folder)
+    tidy(out)
     with Display() as display:
         evaluations = evaluation_jobs(plan, out)
         jobs = [*recording_jobs(plan, out), *training_jobs(plan, out, how.device, how.every), *evaluations]
@@ -127,7 +129,10 @@ def _write_run(plan: Plan, out: Path, how: How, failures: list[Failure]) -> None
             if agent in AGENTS
         },
         "device": how.device,
-        "failed": {failure.job.name: failure.reason for failure in failures},
+        "failed": [
+            {"job": f.job.name, "output": str(f.job.output.relative_to(out)), "reason": f.reason}
+            for f in failures
+        ],
         "demonstrations": cards,
         "agents": {
             env: {

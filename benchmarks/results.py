@@ -137,7 +137,9 @@ def read_rows(path: StrPath) -> pa.Table:
         table.validate(full=True)
         _ = table.column_names  # decodes them, which fails where they are damaged
     except (OSError, ValueError, pa.ArrowException) as error:
-        raise ValueError(f"{path}: cannot be read as results: {error}") from None
+        raise ValueError(
+            f"{path}: cannot be read as results ({error}); remove it to compute it again"
+        ) from None
     return check(table, str(path))
 
 

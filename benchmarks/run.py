@@ -192,19 +192,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
     except KeyboardInterrupt:
         return 130
-    from benchmarks.pipeline import How, execute
-    from rise_agents.files import sole_user
-    from rise_agents.workers import available_cores
-
     command = ("python", "-m", "benchmarks.run", *(sys.argv[1:] if argv is None else argv))
-    how = How(
-        workers=arguments.workers or available_cores(),
-        device=arguments.device,
-        videos=not arguments.no_videos,
-        every=arguments.checkpoint_every,
-        command=command,
-    )
     try:
+        from benchmarks.pipeline import How, execute
+        from rise_agents.files import sole_user
+        from rise_agents.workers import available_cores
+
+        how = How(
+            workers=arguments.workers or available_cores(),
+            device=arguments.device,
+            videos=not arguments.no_videos,
+            every=arguments.checkpoint_every,
+            command=command,
+        )
         with sole_user(out):
             failures = execute(plan, out, how)
     except KeyboardInterrupt:

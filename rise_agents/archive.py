@@ -21,7 +21,6 @@ from rise_agents.files import StrPath, replace_file, sweep
 
 MAGIC = b"RISEfile"
 SCHEMA = 1
-LARGEST = 1 << 32  # bytes that a file may have to be read
 _DIGEST = 32
 
 
@@ -82,8 +81,6 @@ def _content(path: Path) -> bytes:
     try:
         if not path.is_file():  # a device or a pipe might never end
             raise ArchiveError("is no regular file" if path.exists() else "does not exist")
-        if path.stat().st_size > LARGEST:
-            raise ArchiveError(f"has more than {LARGEST:,} bytes")
         return path.read_bytes()
     except (OSError, ValueError) as error:  # ValueError: a name with a null character
         raise ArchiveError(f"cannot be read ({getattr(error, 'strerror', None) or error})") from None

@@ -25,7 +25,11 @@ from rise_agents.files import StrPath
 
 KIND = "agent"
 _PACKAGES = ("rise-suite", "gymnasium", "numpy", "torch", "stable-baselines3", "panda-gym")
-_AGAIN = "give a whole file that agent.save() wrote, or train the agent again"
+TRAINING = "training"
+_REMEDIES = {
+    KIND: "give a whole file that agent.save() wrote, or train the agent again",
+    TRAINING: "remove it to begin anew",
+}
 
 
 class CheckpointError(Exception):
@@ -70,8 +74,8 @@ def save(
     for name, array in arrays.items():
         if not np.isfinite(array).all():
             raise ValueError(f"{name} holds a number that is not finite: the training has diverged")
-    spaces = spaces_digest(description["env"])
-    archive.write(path, kind, arrays, {"versions": versions(), "spaces": spaces, **description})
+    digest = spaces_digest(description["env"])
+    archive.write(path, kind, arrays, {"versions": versions(), "spaces": digest, **description})
 
 
 def load(path: StrPath, kind: str = KIND) -> tuple[dict[str, NDArray], dict[str, Any]]:
@@ -84,11 +88,11 @@ def load(path: StrPath, kind: str = KIND) -> tuple[dict[str, NDArray], dict[str,
     try:
         arrays, description = archive.read(path, kind)
     except archive.ArchiveError as error:
-        raise CheckpointError(path, error.reason, _AGAIN) from None
+        raise CheckpointError(path, error.reason, _REMEDIES[kind]) from None
     _check_env(path, description)
     for name, array in arrays.items():
         if not np.isfinite(array).all():
-            raise CheckpointError(path, f"{name} holds a number that is not finite", _AGAIN)
+            raise CheckpointError(path, f"{name} holds a number that is not finite", _REMEDIES[kind])
     return arrays, description
 
 

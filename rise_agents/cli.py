@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import secrets
 from pathlib import Path
 from typing import Any, NoReturn
 
 from rise_agents.agent import nearest
+from rise_agents.files import replace_file
 
 
 class Parser(argparse.ArgumentParser):
@@ -36,8 +38,6 @@ def prepare_folder(out: Path) -> None:
     """Make a folder; raises ``ValueError`` if nothing can be written there."""
     try:
         out.mkdir(parents=True, exist_ok=True)
-        probe = out / ".writable"
-        probe.touch()
-        probe.unlink()
+        replace_file(out / f"writable-{secrets.token_hex(4)}", b"").unlink()
     except OSError as error:
         raise ValueError(f"cannot write to the folder {str(out)!r}: {error.strerror}") from None

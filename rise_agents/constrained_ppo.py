@@ -184,18 +184,31 @@ class ConstrainedPPO(PPO):
         }
         return arrays, notes
 
-    def restore(self, arrays: dict[str, NDArray], notes: dict[str, Any]) -> None:
-        """Go on from what :meth:`snapshot` gave, by ``learn(..., reset_num_timesteps=False)``."""
+    def restore(self, arrays: dict[str, NDArray], notes: dict[str, Any], total: int) -> None:
+        """Go on from what :meth:`snapshot` gave, in a training of ``total`` steps.
+
+        ``learn(..., reset_num_timesteps=False)`` does the rest.
+
+        Raises:
+            LookupError, TypeError, ValueError, RuntimeError: what is given cannot be from such a training.
+        """
         states: dict[str, Any] = {}
         for name, part in self._parts().items():
             is_module = isinstance(part, torch.nn.Module)
             states[_PARTS[name]] = under(arrays, name) if is_module else optimiser_state(part, arrays, name)
         self.set_parameters(states)
-        self.num_timesteps, self._n_updates = int(notes["steps"]), int(notes["updates"])
+        steps, updates, episodes = notes["steps"], notes["updates"], notes["episodes"]
+        rollout = self.n_steps * self.n_envs
+        possible = type(steps) is int and 0 < steps < total + rollout and steps % rollout == 0
+        if not possible or updates != steps // rollout * self.n_epochs:
+            raise ValueError(f"{steps!r} steps and {updates!r} updates cannot be")
+        if not all(type(each[key]) in (int, float) for each in episodes for key in "rlc"):
+            raise ValueError("episodes are not told by numbers")
+        self.num_timesteps, self._n_updates = steps, updates
         stored = notes["controller"]
         self.controller = Controller(**{**stored, "history": tuple(stored["history"])})
         self.cost_rng.bit_generator.state = notes["cost_rng"]
-        self.ep_info_buffer = deque(notes["episodes"], maxlen=self._stats_window_size)
+        self.ep_info_buffer = deque(episodes, maxlen=self._stats_window_size)
         self.ep_success_buffer = deque(maxlen=self._stats_window_size)
         words = arrays["random.numpy"].astype(np.uint32)
         np.random.set_state(("MT19937", words, notes["numpy_position"], 0, 0.0))  # noqa: NPY002

@@ -125,7 +125,9 @@ class CPPO:
         """
         kept = Resume.of(resume)
         if source is not None and not isinstance(source, str):
-            return self._learn(as_vector_env(source), progress, kept, "a ready environment")
+            venv = as_vector_env(source)
+            name = f"{venv.num_envs} of {venv.spec.id if venv.spec else type(venv).__name__}, ready made"
+            return self._learn(venv, progress, kept, name)
         if source in (None, self.env_id):
             source = self.config.train_env or self.env_id
         venv = make_training_env(str(source), self.config.n_envs)
@@ -141,27 +143,30 @@ class CPPO:
         ranks = self._ranks(venv.single_observation_space)
         c.check_batch(venv.num_envs)
         arrays, notes = kept.open(self, source)
+        if arrays:
+            kept.read(lambda: self._check_arrays(arrays))
         units = self._units(venv, arrays)
         bridge = Bridge(venv, lambda observation: units(self._inputs(observation)), len(units.mean))
+        constants = units.arrays("units")
+        if bounds is not None:
+            constants |= {"action.low": bounds[0], "action.high": bounds[1]}
         with _one_thread():
             ppo = self._trainer(bridge, kept.noting(progress))
 
             def store() -> None:
                 weights, facts = ppo.snapshot()
-                kept.save({**weights, **units.arrays("units")}, facts)
+                kept.save({**weights, **constants}, facts)
 
             ppo.at_restart = lambda: store() if kept.due() else None
             if arrays:
-                restored(ppo, kept, arrays, notes)
+                kept.read(lambda: ppo.restore(arrays, notes, c.total_steps))
             if ppo.num_timesteps < c.total_steps:
                 left = c.total_steps - ppo.num_timesteps
                 # No logging: None is taken, whatever the annotation says.
                 ppo.learn(left, log_interval=None, reset_num_timesteps=not arrays)  # type: ignore[arg-type]
                 store()
         self._arrays, self._notes = ppo.snapshot()
-        self._arrays |= units.arrays("units")
-        if bounds is not None:
-            self._arrays |= {"action.low": bounds[0], "action.high": bounds[1]}
+        self._arrays |= constants
         self._notes["ranks"] = ranks
         self._actor = Actor(self._arrays)
         return self
@@ -311,17 +316,6 @@ class CPPO:
         if boxes:
             low, high = arrays["action.low"], arrays["action.high"]
             require(bool((low < high).all()), "action.low must lie below action.high", (low, high))
-
-
-def restored(ppo: ConstrainedPPO, kept: Resume, arrays: dict[str, NDArray], notes: dict[str, Any]) -> None:
-    """Bring ``ppo`` to where an interrupted training was; ``CheckpointError`` if the file lacks a part."""
-    try:
-        ppo.restore(arrays, notes)
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        first = str(error).strip().splitlines()[0]
-        raise checkpoint.CheckpointError(
-            kept.path or "", f"lacks a part of the training ({first})", "remove it to begin anew"
-        ) from None
 
 
 def _check_known(env_id: str) -> None:

@@ -7,11 +7,12 @@ never takes away what another process is still writing.
 
 from __future__ import annotations
 
-import glob
+import hashlib
 import os
+import re
 import secrets
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
@@ -23,7 +24,7 @@ except ImportError:  # no POSIX system: temporary files are neither locked nor s
     fcntl = None  # type: ignore[assignment]
 
 StrPath = str | os.PathLike[str]
-_MARK = ".partial-"
+_TEMPORARY = re.compile(r"\.partial-[0-9a-f]{16}-([0-9a-f]{8}.*)")
 
 
 @contextmanager
@@ -36,36 +37,40 @@ def replacing(path: StrPath) -> Iterator[Path]:
     Raises:
         OSError: the file cannot be written (no space, no permission); an earlier one is intact.
     """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    lock = _open_locked(path)
-    temporary = Path(lock.name)
+    path = Path(os.path.realpath(path))  # what a link leads to, not the link
     try:
-        yield temporary
-        with temporary.open("rb+") as file:
-            os.fsync(file.fileno())
-        temporary.replace(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with _open_locked(path) as lock:
+            temporary = Path(lock.name)
+            try:
+                yield temporary
+                with temporary.open("rb+") as file:
+                    os.fsync(file.fileno())
+                temporary.replace(path)
+            except BaseException:
+                temporary.unlink(missing_ok=True)
+                raise
         _sync_folder(path.parent)
-    except BaseException as error:
-        temporary.unlink(missing_ok=True)
-        if isinstance(error, OSError) and error.errno:  # of the name that the caller knows
-            raise OSError(error.errno, os.strerror(error.errno), str(path)) from None
-        raise
-    finally:
-        lock.close()
+    except OSError as error:  # of the name that the caller knows
+        raise OSError(error.errno, error.strerror or str(error), str(path)) from None
 
 
-def replace_file(path: StrPath, content: bytes) -> None:
-    """Write ``content`` to ``path``, see :func:`replacing`."""
+def replace_file(path: StrPath, content: bytes) -> Path:
+    """Write ``content`` to ``path``, see :func:`replacing`; returns the path."""
     with replacing(path) as temporary:
         temporary.write_bytes(content)
+    return Path(path)
 
 
 def sweep(folder: StrPath, name: str | None = None) -> None:
     """Remove what writers that were killed left in ``folder`` (of the file ``name``; by default of all)."""
     if fcntl is None:
         return
-    for stray in Path(folder).glob(f"{_MARK}*" if name is None else f"{_MARK}*-{glob.escape(name)}"):
+    own = None if name is None else _ending(name)
+    for stray in Path(folder).glob(".partial-*"):
+        match = _TEMPORARY.fullmatch(stray.name)
+        if match is None or own not in (None, match[1]):
+            continue
         try:
             with stray.open("rb") as file:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -97,22 +102,26 @@ def sole_user(folder: StrPath) -> Iterator[None]:
 def _open_locked(path: Path) -> IO[bytes]:
     # Not tempfile: its files are private to the user, and results are there to be shared.
     while True:
-        file = path.with_name(f"{_MARK}{secrets.token_hex(8)}-{path.name}").open("xb")
+        file = path.with_name(f".partial-{secrets.token_hex(8)}-{_ending(path.name)}").open("xb")
         if fcntl is None:
             return file
-        fcntl.flock(file, fcntl.LOCK_EX)
+        with suppress(OSError):  # where files cannot be locked, nothing is swept either
+            fcntl.flock(file, fcntl.LOCK_EX)
         if Path(file.name).exists():
             return file
         file.close()  # a sweep took it for a stray between these lines
 
 
+def _ending(name: str) -> str:
+    """What the temporary files of ``name`` end with: short, and of the same kind."""
+    return hashlib.sha256(name.encode(errors="surrogateescape")).hexdigest()[:8] + Path(name).suffix
+
+
 def _sync_folder(folder: Path) -> None:
-    """Make the new name durable too."""
-    try:
+    """Make the new name durable too, where the system lets us."""
+    with suppress(OSError):
         handle = os.open(folder, os.O_RDONLY)
-    except OSError:  # where folders cannot be opened, names are kept without asking
-        return
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)

@@ -59,18 +59,19 @@ class Pool:
         self._crew: list[_Worker] = []
 
     def __enter__(self) -> Pool:
-        limit_threads()
-        _hush_tracker()
         return self
 
     def __exit__(self, *exception: object) -> None:
-        for worker in self._crew:
-            worker.connection.close()  # which sends the idle home
-            if worker.task is not None:
-                worker.process.terminate()
-        for worker in self._crew:
-            worker.process.join(5)
-            worker.process.kill()
+        try:
+            for worker in self._crew:
+                worker.connection.close()  # which sends the idle home
+                if worker.task is not None:
+                    worker.process.terminate()
+            for worker in self._crew:
+                worker.process.join(5)
+        finally:  # also if the user loses patience
+            for worker in self._crew:
+                worker.process.kill()
 
     @property
     def busy(self) -> int:
@@ -102,6 +103,8 @@ class _Worker:
     """The parent's side of a worker process."""
 
     def __init__(self) -> None:
+        limit_threads()
+        _hush_tracker()
         context = multiprocessing.get_context("spawn")
         self.connection, theirs = context.Pipe()
         # Not daemonic: some tasks start processes themselves.
@@ -140,7 +143,12 @@ class _Worker:
 
 
 def _how(exitcode: int) -> str:
-    return signal.Signals(-exitcode).name if exitcode < 0 else f"exit code {exitcode}"
+    if exitcode >= 0:
+        return f"exit code {exitcode}"
+    try:
+        return signal.Signals(-exitcode).name
+    except ValueError:  # real-time signals have no names
+        return f"signal {-exitcode}"
 
 
 def _hush_tracker() -> None:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from numpy.typing import NDArray
 
@@ -13,7 +14,8 @@ from rise_agents.agent import Progress, config_to_dict
 from rise_agents.checkpoint import CheckpointError
 from rise_agents.files import StrPath
 
-KIND = "training"
+KIND = checkpoint.TRAINING
+T = TypeVar("T")
 
 
 class Resume:
@@ -30,6 +32,8 @@ class Resume:
 
     def __init__(self, path: StrPath | None = None, every: float = 15.0) -> None:
         self.path = None if path is None else Path(path)
+        if not (isinstance(every, int | float) and not isinstance(every, bool) and every >= 0):
+            raise ValueError(f"every must be a number of seconds, not negative, got {every!r}")
         self.every = every
         self.curve: list[dict[str, float]] = []
         self.seconds = 0.0
@@ -53,6 +57,7 @@ class Resume:
             CheckpointError: the file is damaged, or of another training or version.
         """
         self._started = self._written = time.monotonic()
+        self.curve, self._before = [], 0.0
         if self.path is None:
             return {}, {}
         self._facts = {
@@ -68,11 +73,26 @@ class Resume:
         arrays, description = checkpoint.load(self.path, KIND)
         for name, value in {**self._facts, "versions": checkpoint.versions()}.items():
             if description.get(name) != value:
-                reason = f"holds a training with {name} {description.get(name)}, this one has {value}"
+                theirs, ours = _differing(description.get(name), value)
+                reason = f"holds a training with {name} {theirs}, this one has {ours}"
                 raise CheckpointError(self.path, reason, "remove it to begin anew, or name another file")
-        self.curve, self._before = list(description["curve"]), float(description["seconds"])
+        curve, seconds, notes = (description.get(name) for name in ("curve", "seconds", "notes"))
+        if not (_is_curve(curve) and type(seconds) is float and seconds >= 0 and isinstance(notes, dict)):
+            raise CheckpointError(self.path, "lacks a part of the training", "remove it to begin anew")
+        self.curve, self._before = list(curve or ()), seconds
         self._clock()
-        return arrays, description["notes"]
+        return arrays, notes
+
+    def read(self, how: Callable[[], T]) -> T:
+        """``how()``, which makes use of what the file holds; whatever is wrong with that is a ``CheckpointError``."""
+        if self.path is None:
+            return how()
+        try:
+            return how()
+        except (LookupError, TypeError, ValueError, ArithmeticError, RuntimeError, AttributeError) as error:
+            first = (str(error).strip() or type(error).__name__).splitlines()[0]
+            reason = f"lacks a part of the training ({first})"
+            raise CheckpointError(self.path, reason, "remove it to begin anew") from None
 
     def noting(self, progress: Progress) -> Progress:
         """``progress`` whose figures also go to :attr:`curve`."""
@@ -98,3 +118,19 @@ class Resume:
 
     def _clock(self) -> None:
         self.seconds = self._before + time.monotonic() - self._started
+
+
+def _differing(theirs: Any, ours: Any) -> tuple[Any, Any]:
+    """Of two dicts the entries that differ; anything else as it is."""
+    if not (isinstance(theirs, dict) and isinstance(ours, dict)):
+        return theirs, ours
+    keys = [key for key in {**theirs, **ours} if theirs.get(key) != ours.get(key)]
+    return {key: theirs.get(key) for key in keys}, {key: ours.get(key) for key in keys}
+
+
+def _is_curve(curve: Any) -> bool:
+    """Whether these are figures of progress, by name."""
+    return isinstance(curve, list) and all(
+        isinstance(point, dict) and all(isinstance(value, int | float) for value in point.values())
+        for point in curve
+    )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -10,7 +9,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from rise_agents.checkpoint import CheckpointError
 from rise_agents.resume import Resume
 
 Arrays = dict[str, NDArray]
@@ -73,14 +71,19 @@ class Stage:
             Updates that are done (0 at the start), and the state of the generator at the start of the pass through
             the data that is under way.
         """
-        return self.stages.read(partial(self._restore, module, optimiser, generator, updates))
+        return self.stages.resume.read(partial(self._restore, module, optimiser, generator, updates))
 
     def _restore(
         self, module: nn.Module, optimiser: torch.optim.Optimizer, generator: torch.Generator, updates: int
     ) -> tuple[int, Tensor]:
-        arrays, done = self.stages.arrays, int(self.stages.done.get(self.name, 0))
+        arrays, done = self.stages.arrays, self.stages.done.get(self.name, 0)
+        if type(done) is not int or not 0 <= done <= updates:
+            raise ValueError(f"{done!r} of {updates} updates are done")
         if not done:
             return 0, generator.get_state()
+        for key, array in arrays.items():
+            if key.startswith(f"{self.name}.") and array.dtype.kind != "f":
+                raise ValueError(f"{key} is {array.dtype}, not float")
         module.load_state_dict(under(arrays, self.name))
         random = under(arrays, f"{self.name}/random")
         generator.set_state(random["now"])
@@ -115,23 +118,19 @@ class Stages:
 
     def __init__(self, resume: Resume, arrays: Arrays, notes: dict[str, Any]) -> None:
         self.resume, self.arrays = resume, arrays
-        self.done: dict[str, int] = self.read(lambda: dict(notes.get("updates", {})))
+        self.done: dict[str, int] = resume.read(lambda: self._done(notes))
+
+    def _done(self, notes: dict[str, Any]) -> dict[str, int]:
+        """Updates of each stage that is stored; ``ValueError`` if the notes speak of others."""
+        done = dict(notes.get("updates", {}))
+        stored = {key.split(".")[0].split("/")[0] for key in self.arrays}
+        if set(done) != stored:
+            raise ValueError(f"it holds the stages {sorted(stored)} and speaks of {sorted(map(str, done))}")
+        return done
 
     def __getitem__(self, name: str) -> Stage:
         """The stage called ``name``."""
         return Stage(self, name)
-
-    def read(self, how: Callable[[], Any]) -> Any:
-        """``how()``, with whatever is wrong with the stored state told as a ``CheckpointError``."""
-        try:
-            return how()
-        except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
-            if self.resume.path is None:
-                raise
-            first = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-            raise CheckpointError(
-                self.resume.path, f"lacks a part of the training ({first})", "remove it to begin anew"
-            ) from None
 
     def save(self, name: str, done: int, current: Arrays) -> None:
         """Write all stages, with ``current`` in place of what there was of stage ``name``."""

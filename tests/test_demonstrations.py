@@ -222,5 +222,45 @@ def test_an_interrupted_recording_goes_on(tmp_path):
 
 def test_pieces_of_another_recording_are_refused(tmp_path):
     generate(VEHICLE, "cbf", 10, parts=tmp_path)
-    with pytest.raises(DatasetError, match=r"0000000.rise.*'cbf'.*'mpc'"):
+    with pytest.raises(DatasetError, match=r"0000000.rise.*'cbf'.*'mpc'.*remove"):
         generate(VEHICLE, "mpc", 10, parts=tmp_path)
+
+
+def test_a_piece_that_somebody_takes_away_is_recorded_again(tmp_path):
+    def take(kept, tried):
+        (tmp_path / "0000050.rise").unlink(missing_ok=True)
+
+    assert len(generate(VEHICLE, "cbf", 150, workers=2, finished=take, parts=tmp_path)) == 150
+
+
+def test_forged_pieces_are_refused(tmp_path):
+    generate(VEHICLE, "cbf", 10, parts=tmp_path)
+    piece = tmp_path / "0000000.rise"
+    arrays, facts = archive.read(piece, "candidates")
+    for change in (
+        {},
+        {**arrays, "transitions.actions.": arrays["transitions.actions."] * np.nan},
+        {**arrays, "transitions.costs.": arrays["transitions.costs."] + 1},
+        {**arrays, "seeds": arrays["seeds"][:3]},
+    ):
+        archive.write(piece, "candidates", change, facts)
+        with pytest.raises(DatasetError):
+            generate(VEHICLE, "cbf", 10, parts=tmp_path)
+    archive.write(piece, "candidates", arrays, {**facts, "versions": {"numpy": "0.1"}})
+    with pytest.raises(DatasetError, match=r"is of another recording, with \{'versions'"):
+        generate(VEHICLE, "cbf", 10, parts=tmp_path)
+
+
+def test_another_recording_in_the_same_folder_begins_anew(tmp_path, capsys, monkeypatch):
+    """What was recorded of the first one is left alone until one of them is finished."""
+    out, base = tmp_path / "set", ["--env", VEHICLE, "--episodes", "12", "--workers", "1"]
+    monkeypatch.setattr("rise_agents.demonstrations.Demonstrations.save", _interrupt)
+    assert main([*base, "--expert", "mpc", "--out", str(out)]) == 130
+    monkeypatch.undo()
+    assert main([*base, "--expert", "cbf", "--out", str(out)]) == 0
+    assert load(out).card["expert"] == "cbf"
+    assert not (out / ".parts").exists()
+
+
+def _interrupt(*_):
+    raise KeyboardInterrupt

@@ -69,10 +69,34 @@ def test_what_is_being_written_is_no_stray_until_its_writer_is_killed(tmp_path, 
 
 
 def test_a_sweep_takes_nothing_else(tmp_path):
-    for name in ("results.csv", ".hidden", "partial-1-x"):
+    for name in ("results.csv", ".hidden", "partial-1-x", ".partial-download-of-another-program"):
         (tmp_path / name).touch()
     sweep(tmp_path)
-    assert len(list(tmp_path.iterdir())) == 3
+    assert len(list(tmp_path.iterdir())) == 4
+
+
+def test_a_sweep_of_one_file_leaves_the_strays_of_others(tmp_path):
+    for name in ("a.txt", "b.txt"):
+        with pytest.raises(KeyboardInterrupt), replacing(tmp_path / name) as temporary:
+            kept = temporary.name
+            raise KeyboardInterrupt
+        (tmp_path / kept).touch()  # as if it had been killed
+    sweep(tmp_path, "a.txt")
+    assert [path.name for path in tmp_path.iterdir()] == [kept]
+
+
+def test_a_link_is_written_through(tmp_path):
+    (tmp_path / "real").write_bytes(b"old")
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    replace_file(tmp_path / "link", b"new")
+    assert (tmp_path / "link").is_symlink() and (tmp_path / "real").read_bytes() == b"new"
+
+
+def test_long_names_and_errors_name_the_file_itself(tmp_path):
+    replace_file(tmp_path / ("x" * 251 + ".csv"), b"")
+    with pytest.raises(OSError, match="file/below"):
+        (tmp_path / "file").touch()
+        replace_file(tmp_path / "file" / "below", b"")
 
 
 def _hold(folder, held):

@@ -59,6 +59,12 @@ def test_results_errors_deaths_and_what_tasks_tell():
     assert told == [("a", ("half", 3)), ("d", ("half", 4))]
 
 
+def test_a_signal_without_a_name_is_numbered():
+    with Pool(1) as pool:
+        pool.start(0, _die, 40)
+        assert everything(pool, 1)[0].died == "signal 40"
+
+
 def test_a_worker_is_used_again():
     with Pool(1) as pool:
         for x in range(3):
@@ -121,6 +127,13 @@ def _write(output, progress):
     output.write_text("done")
 
 
+def _write_and_die(output, progress):
+    with output.open("a") as file:
+        file.write("once")
+    os.kill(os.getpid(), 40)  # a real-time signal, which has no name
+    time.sleep(60)
+
+
 def _write_nothing(output, progress):
     pass
 
@@ -133,6 +146,7 @@ def test_a_killed_worker_is_named_and_its_job_tried_again_up_to_a_limit(tmp_path
         Job("after never", _write, {}, tmp_path / "c", needs=(tmp_path / "b",)),
         Job("fine", _write, {}, tmp_path / "d"),
         Job("empty", _write_nothing, {}, tmp_path / "e"),
+        Job("done before it died", _write_and_die, {}, tmp_path / "f"),
     ]
     failures = run_jobs(jobs, 2, lambda job, share, figures: seen.append((job.name, share)), said.append)
     assert {failure.job.name: failure.reason for failure in failures} == {
@@ -140,6 +154,7 @@ def test_a_killed_worker_is_named_and_its_job_tried_again_up_to_a_limit(tmp_path
         "after never": "a job that it needs failed",
         "empty": f"it ended without writing {tmp_path / 'e'}",
     }
+    assert (tmp_path / "f").read_text() == "once"
     assert (tmp_path / "a").read_text() == (tmp_path / "d").read_text() == "done"
     assert sum("third time" in line and "SIGTERM" in line for line in said) == 2
     assert (

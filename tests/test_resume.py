@@ -108,7 +108,26 @@ def test_a_damaged_or_forged_state_is_refused(name, vehicle_demonstrations, tmp_
         with pytest.raises(CheckpointError, match="lacks a part"):
             again = learner(name)
             again.learn(source_of(again, vehicle_demonstrations), resume=path)
+    whole_number = next(key for key in arrays if key.endswith(".weight"))
+    forged = [({**arrays, whole_number: arrays[whole_number].astype(np.int64)}, description)]
+    changes = ({"curve": 3}, {"curve": [{"x": "y"}]}, {"seconds": "long"}, {"seconds": -1.0}, {"notes": []})
+    forged += [(arrays, {**description, **change}) for change in changes]
+    numbers = ("updates",) if name != "cppo" else ("updates", "steps", "episodes", "controller", "cost_rng")
+    for entry in numbers:
+        for value in (None, -5, 10**30, [1], [{}], {"state": {"state": 2**200}}):
+            forged.append((arrays, {**description, "notes": {**description["notes"], entry: value}}))
+    for changed, told in forged:
+        archive.write(path, "training", changed, told)
+        again = learner(name)
+        with pytest.raises(CheckpointError, match=r"lacks a part.*remove it to begin anew"):
+            again.learn(source_of(again, vehicle_demonstrations), resume=path)
     path.write_bytes(path.read_bytes()[:-1])
-    with pytest.raises(CheckpointError, match="damaged"):
+    with pytest.raises(CheckpointError, match=r"damaged.*remove it to begin anew"):
         again = learner(name)
         again.learn(source_of(again, vehicle_demonstrations), resume=path)
+
+
+@pytest.mark.parametrize("every", [-1, float("nan"), True, "x", None])
+def test_an_interval_that_is_none_is_refused(every):
+    with pytest.raises(ValueError, match="every must be"):
+        Resume("file", every)

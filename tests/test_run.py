@@ -217,7 +217,7 @@ def test_what_a_killed_run_left_is_swept_and_what_it_finished_is_kept(run, tmp_p
     for path in kept[::2]:
         path.unlink()
     for folder in (out, out / "parts" / VEHICLE, out / "agents" / VEHICLE):
-        (folder / ".partial-0123-episodes.parquet").write_bytes(b"half")
+        (folder / ".partial-0123456789abcdef-01234567.parquet").write_bytes(b"half")
     before = {path: path.stat().st_mtime_ns for path in [*kept[1::2], *(out / "agents").rglob("*.rise")]}
     assert main([*SMALL, "--workers", "1", "--no-videos", "--out", str(out)]) == 0
     assert {path: path.stat().st_mtime_ns for path in before} == before
@@ -246,7 +246,8 @@ def test_failures_end_in_exit_code_1_and_are_recorded(tmp_path, capsys, monkeypa
     error = capsys.readouterr().err
     assert "damaged" in error and "Traceback" not in error
     failed = json.loads((tmp_path / "run.json").read_text())["failed"]
-    assert f"train pcbc on {VEHICLE}" in failed
+    assert f"train pcbc on {VEHICLE}" in [each["job"] for each in failed]
+    assert all(not (tmp_path / each["output"]).exists() or "damaged" in each["reason"] for each in failed)
     assert "DatasetError" in (tmp_path / "failures.log").read_text()
     agents = {row["agent"] for row in results.read_rows(tmp_path / "episodes.parquet").to_pylist()}
     assert agents == {"random"}

@@ -9,10 +9,14 @@ import time
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rise_agents.agent import nearest
 from rise_agents.cli import Parser, prepare_folder
 from rise_agents.workers import available_cores
+
+if TYPE_CHECKING:
+    from benchmarks.faults import measure
 
 QUICK = 0.02
 _SHOWN = 20  # faults of a row that are printed; all are in faults.txt
@@ -78,13 +82,19 @@ def chosen(arguments: argparse.Namespace) -> list[str]:
         raise ValueError(f"--workers must be at least 1, got {arguments.workers}")
     if arguments.only is not None and (arguments.only < 0 or len(names) != 1):
         raise ValueError("--only takes the number of a trial, from 0 on, of the one row that --rows names")
+    if arguments.only is not None and (arguments.render or arguments.docs):
+        raise ValueError("--only makes one trial, which is no table: leave out --render and --docs")
     if arguments.docs:
         FAULTS.check(arguments.docs)
     return names
 
 
-def try_all(names: Sequence[str], share: float, arguments: argparse.Namespace) -> None:
-    """Make the trials; writes ``faults.csv``, ``faults.txt`` and ``machine.txt``."""
+def try_all(names: Sequence[str], share: float, arguments: argparse.Namespace) -> list[measure.Result]:
+    """Make the trials; writes ``faults.csv``, ``faults.txt`` and ``machine.txt``, but for ``--only`` one trial.
+
+    Returns:
+        The results of the rows that were tried.
+    """
     from benchmarks import pages
     from benchmarks.display import Display
     from benchmarks.faults import measure
@@ -95,7 +105,10 @@ def try_all(names: Sequence[str], share: float, arguments: argparse.Namespace) -
     out: Path = arguments.out
     table = out / "faults.csv"
     results = measure.read_csv(table) if table.exists() else []  # other rows stay as they are
+    tried: list[measure.Result] = []
     lines: list[str] = []
+    if arguments.only is None:
+        atomic_write_text(out / "machine.txt", pages.machine() + "\n")
     with measure.temporary_folder(keep=lambda: bool(lines)) as folder, Display() as display:
         effort = measure.Effort(share, arguments.seed, workers, arguments.only, folder)
         for name in names:
@@ -106,14 +119,17 @@ def try_all(names: Sequence[str], share: float, arguments: argparse.Namespace) -
                 print(f"benchmarks.faults: {line}", file=sys.stderr)
             if found[_SHOWN:]:
                 print(f"benchmarks.faults: {name}: {len(found) - _SHOWN} more", file=sys.stderr)
-            results = pages.renewed(results, [result], ROWS)
+            tried.append(result)
             lines += found
+            if arguments.only is not None:
+                continue
+            results = pages.renewed(results, [result], ROWS)
             # After each row: an interruption hours later loses only the row that it meets.
             measure.write_csv(table, results)
             atomic_write_text(out / "faults.txt", "".join(f"{line}\n" for line in lines))
-    atomic_write_text(out / "machine.txt", pages.machine() + "\n")
     if lines:
         print(f"benchmarks.faults: the files of these trials are in {folder}", file=sys.stderr)
+    return tried
 
 
 def render(out: Path, docs: Path | None, names: Sequence[str]) -> bool:
@@ -122,11 +138,12 @@ def render(out: Path, docs: Path | None, names: Sequence[str]) -> bool:
     Raises:
         ValueError: they are not there.
     """
+    from benchmarks import pages
     from benchmarks.faults import measure, page
     from benchmarks.results import atomic_write_text
 
     results = measure.read_csv(out / "faults.csv")
-    about = (out / "machine.txt").read_text().strip()
+    about = pages.known_machine(out)
     text = page.markdown(results, about)
     atomic_write_text(out / "faults.md", "# Faults\n\n" + text)
     if docs:
@@ -147,7 +164,12 @@ def main(argv: Sequence[str] | None = None) -> int:
             from rise_agents.workers import limit_threads
 
             limit_threads()
-            try_all(names, share, arguments)
+            tried = try_all(names, share, arguments)
+        if arguments.only is not None:
+            from benchmarks.faults.page import table_text
+
+            print(table_text(tried))
+            return 0 if all(result.met != "no" for result in tried) else 1
         met = render(arguments.out, arguments.docs, names)
     except ValueError as error:
         print(f"benchmarks.faults: {error}", file=sys.stderr)

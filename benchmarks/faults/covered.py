@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from benchmarks.faults.measure import Effort, Fault, Findings, Tell, Unavailable
 
@@ -36,8 +37,22 @@ def measured(
     return done.returncode
 
 
-def report(place: Path, root: Path = ROOT) -> tuple[float, list[tuple[float, str]]]:
-    """The branch coverage in per cent, and that of each file, the least covered first."""
+class Report(NamedTuple):
+    """What was reached, in per cent.
+
+    Attributes:
+        all: lines and branches together, as coverage counts them.
+        branches: branches alone.
+        files: of each file, lines and branches, the least covered first.
+    """
+
+    all: float
+    branches: float
+    files: list[tuple[float, str]]
+
+
+def report(place: Path, root: Path = ROOT) -> Report:
+    """The coverage that the runs in ``place`` have left."""
     environment = {**os.environ, "COVERAGE_FILE": str(place / ".coverage")}
     target = place / "coverage.json"
     for words in (["combine", "-q"], ["json", "-q", "-o", str(target)]):
@@ -51,10 +66,12 @@ def report(place: Path, root: Path = ROOT) -> tuple[float, list[tuple[float, str
         ]
         done = subprocess.run(command, cwd=root, env=environment, capture_output=True)  # noqa: S603
         if done.returncode:  # nothing of ours was imported
-            return 0.0, []
+            return Report(0.0, 0.0, [])
     found = json.loads(target.read_text())
     files = sorted((each["summary"]["percent_covered"], name) for name, each in found["files"].items())
-    return float(found["totals"]["percent_covered"]), files
+    totals = found["totals"]
+    branches = 100 * totals["covered_branches"] / max(1, totals["num_branches"])
+    return Report(float(totals["percent_covered"]), branches, files)
 
 
 def run(
@@ -74,13 +91,14 @@ def run(
         code = measured(files, place, effort.workers)
         tell(0.6, {})
         if not tests and effort.share == 1:
-            measured(compiled, place, effort.workers, compiler=False)
-        findings.figure, by_file = report(place)
+            code = measured(compiled, place, effort.workers, compiler=False) or code
+        reached = report(place)
+        findings.figure = reached.all
         if code:
             tail = (place / "log").read_text(errors="replace").strip().splitlines()[-1:]
             findings.add(0, [Fault("failed test run", " ".join(tail))], 0)
             effort.keep(place / "log", "log")
     findings.trials = len(files)
-    least = ", ".join(f"{Path(name).as_posix()} {share:.0f} %" for share, name in by_file[:5])
-    findings.note = f"least covered: {least}"
+    least = ", ".join(f"{Path(name).as_posix()} {share:.0f} %" for share, name in reached.files[:5])
+    findings.note = f"lines and branches; branches alone {reached.branches:.1f} %; least covered: {least}"
     return findings

@@ -213,8 +213,11 @@ def summarise(row: Row, effort: Effort, findings: Findings, seconds: float) -> R
     found = ", ".join(f"{count} {kind}" for kind, count in kinds.items())
     if findings.figure is not None:
         found = ", ".join(filter(None, [f"{findings.figure:.4g} {row.target.unit}", found]))
+    nothing = not findings.trials and not findings.faults and findings.figure is None
     judged = row.scaled or (effort.share >= 1 and effort.only is None)
     met = ("yes" if row.target.met(findings) else "no") if judged or findings.faults else ""
+    if nothing:
+        found, met = "no such trial", "no"
     return Result(
         row.name,
         findings.trials,

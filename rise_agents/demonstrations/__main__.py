@@ -15,6 +15,7 @@ from rise_agents import demonstrations
 from rise_agents.agent import nearest
 from rise_agents.cli import Parser, prepare_folder
 from rise_agents.demonstrations.minari_io import check_id, export
+from rise_agents.demonstrations.recording import chunk_size
 from rise_agents.experts import expert_names
 from rise_agents.files import sole_user, sweep
 from rise_agents.pool import TaskError
@@ -80,7 +81,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"rise_agents.demonstrations: {error}", file=sys.stderr)
         return 2
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    pieces = a.out / ".parts"
+    pieces = a.out / ".parts" / f"{a.expert}-seed{a.seed}-{chunk_size(a.episodes)}"
     try:
         with sole_user(a.out), Progress(*columns, console=console, disable=not console.is_terminal) as bars:
             sweep(a.out)
@@ -95,7 +96,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 parts=pieces,
             )
             made.save(a.out)
-            shutil.rmtree(pieces)
+            shutil.rmtree(a.out / ".parts", ignore_errors=True)
             if a.minari is not None:
                 export(made, a.minari)
     except KeyboardInterrupt:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rise_agents import archive
 from rise_agents.agent import Progress, silent
 from rise_agents.checkpoint import versions
-from rise_agents.demonstrations.dataset import OBSERVATIONS, DatasetError, Demonstrations, params_of
+from rise_agents.demonstrations.dataset import OBSERVATIONS, DatasetError, Demonstrations, check, params_of
 from rise_agents.experts import make_expert
 from rise_agents.pool import Pool, TaskError
 from rise_agents.rollout import Transitions, policy_keys, rollout
@@ -67,16 +67,28 @@ def record_part(
 
 
 def _facts(env_id: str, expert: str, seed: int, start: int, count: int) -> dict[str, Any]:
-    return {"env": env_id, "expert": expert, "seed": seed, "start": start, "count": count}
+    """What a piece must agree with to be part of a recording."""
+    return {
+        **{"env": env_id, "expert": expert, "seed": seed, "start": start, "count": count},
+        **{"params": params_of(env_id), "versions": versions()},
+    }
 
 
 def _read_part(path: Path, facts: dict[str, Any]) -> Part:
     try:
         arrays, found = archive.read(path, KIND)
         if found != facts:
-            raise archive.ArchiveError(f"holds {found}, not {facts}")
+            differing = [key for key in facts if found.get(key) != facts[key]]
+            both = [{key: each.get(key) for key in differing} for each in (found, facts)]
+            raise archive.ArchiveError(f"is of another recording, with {both[0]}, this one has {both[1]}")
+        return _as_part(arrays)
     except archive.ArchiveError as error:
-        raise DatasetError(f"{path}: {error.reason}; remove it to record it again") from None
+        raise DatasetError(f"{path}: {error.reason}; remove {path.parent} to record anew") from None
+    except (LookupError, TypeError, ValueError) as error:  # a right digest does not make it whole
+        raise DatasetError(f"{path}: lacks a part ({error}); remove it to record it again") from None
+
+
+def _as_part(arrays: dict[str, NDArray]) -> Part:
     grouped: dict[str, Any] = {}
     for key, array in arrays.items():
         if key.startswith("transitions."):
@@ -128,7 +140,18 @@ def generate(
                 raise ValueError(
                     f"expert {expert!r} succeeds in {kept} of {tried} episodes of {env_id}: no use going on"
                 )
-    return _assemble(env_id, expert, episodes, seed, done)
+    if kept < episodes:
+        raise ValueError(
+            f"expert {expert!r} has {kept} good episodes of {env_id} in all {tried:,} of seed {seed}"
+        )
+    try:
+        demonstrations = _assemble(env_id, expert, episodes, seed, done)
+        check(demonstrations)  # of pieces that were read from files
+    except (LookupError, TypeError, ValueError) as error:
+        raise DatasetError(
+            f"{parts}: a piece is not what it should be ({error}); remove the folder"
+        ) from None
+    return demonstrations
 
 
 def _ordered(
@@ -144,6 +167,8 @@ def _ordered(
             if alone and not path.exists():
                 record_part(path, silent, env_id, expert, seed, number * count, count)
             while not path.exists():
+                if not pool.busy:
+                    begun = number  # also after somebody has taken a piece away
                 while pool.free and begun < max(needed, number + 1):
                     start = begun * count
                     if not part_path(folder, start).exists():
