@@ -262,5 +262,17 @@ def test_another_recording_in_the_same_folder_begins_anew(tmp_path, capsys, monk
     assert not (out / ".parts").exists()
 
 
+def test_a_set_that_is_there_can_still_be_exported(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    out = ["--env", VEHICLE, "--expert", "cbf", "--workers", "1", "--out", str(tmp_path / "set")]
+    assert main([*out, "--episodes", "3"]) == 0
+    before = (tmp_path / "set" / DATA).stat().st_mtime_ns
+    assert main([*out, "--episodes", "3", "--minari", "rise/vehicle-v0"]) == 0
+    assert (tmp_path / "set" / DATA).stat().st_mtime_ns == before
+    assert len(minari_io.load("rise/vehicle-v0", VEHICLE)) == 3
+    assert main([*out, "--episodes", "4", "--minari", "rise/vehicle-v1"]) == 1
+    assert "holds a set of --episodes 3" in capsys.readouterr().err
+
+
 def _interrupt(*_):
     raise KeyboardInterrupt

@@ -29,6 +29,8 @@ examples:
   python -m rise_agents.demonstrations --env RISE-SafePanda-v0 --expert cbf --episodes 500 --out demos/panda
   python -m rise_agents.demonstrations --env RISE-GroundVehicle-v0 --out demos/vehicle --minari rise/vehicle-v0
 
+With --minari, a set that the folder holds already is exported.
+
 The result is the same for any number of workers. A recording that was stopped goes on where it was: give the same
 command again.
 """
@@ -64,12 +66,22 @@ def checked(argv: Sequence[str] | None) -> argparse.Namespace:
         if getattr(a, name) is not None and getattr(a, name) < 1:
             raise ValueError(f"--{name} must be at least 1, got {getattr(a, name)}")
     episode_seeds("train", a.seed, 0, a.episodes)  # raises where the seeds do not suffice
-    if (a.out / demonstrations.DATA).exists():
+    if (a.out / demonstrations.DATA).exists() and a.minari is None:
         raise ValueError(f"{a.out} holds a demonstration set already: name another folder or remove it")
     if a.minari is not None:
         check_id(a.minari)
     prepare_folder(a.out)
     return a
+
+
+def recorded(a: argparse.Namespace) -> demonstrations.Demonstrations:
+    """The set that is in the folder already; raises ``ValueError`` if it is not the one that the arguments ask for."""
+    made = demonstrations.load(a.out)
+    there = {"env": made.env_id, **made.card}
+    for name in ("env", "expert", "episodes", "seed"):
+        if there.get(name) != getattr(a, name):
+            raise ValueError(f"{a.out} holds a set of --{name} {there.get(name)}: name another folder")
+    return made
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -85,17 +97,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         with sole_user(a.out), Progress(*columns, console=console, disable=not console.is_terminal) as bars:
             sweep(a.out)
-            bar = bars.add_task(f"{a.expert} on {a.env}", total=a.episodes)
-            made = demonstrations.generate(
-                a.env,
-                a.expert,
-                a.episodes,
-                a.seed,
-                a.workers or available_cores(),
-                finished=lambda kept, tried: bars.update(bar, completed=kept),
-                parts=pieces,
-            )
-            made.save(a.out)
+            if (a.out / demonstrations.DATA).exists():  # the export is what is missing
+                made = recorded(a)
+            else:
+                bar = bars.add_task(f"{a.expert} on {a.env}", total=a.episodes)
+                made = demonstrations.generate(
+                    a.env,
+                    a.expert,
+                    a.episodes,
+                    a.seed,
+                    a.workers or available_cores(),
+                    finished=lambda kept, tried: bars.update(bar, completed=kept),
+                    parts=pieces,
+                )
+                made.save(a.out)
             shutil.rmtree(a.out / ".parts", ignore_errors=True)
             if a.minari is not None:
                 export(made, a.minari)
