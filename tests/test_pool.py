@@ -176,8 +176,10 @@ def test_jobs_wait_for_what_they_need(tmp_path, workers):
 
 
 _INTERRUPTED = """
+import signal
 import sys
 from pathlib import Path
+signal.signal(signal.SIGINT, signal.default_int_handler)  # tests in the background inherit that it is ignored
 sys.path.insert(0, {tests!r})
 from test_pool import _sleep
 from rise_agents.pool import Pool
