@@ -14,6 +14,7 @@ import traceback
 from collections.abc import Callable
 from contextlib import contextmanager
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
@@ -110,6 +111,7 @@ class _Worker:
         # Not daemonic: some tasks start processes themselves.
         self.process = context.Process(target=_serve, args=(theirs,), daemon=False)
         self.task: Any = None
+        resource_tracker.ensure_running()  # which would lift the block
         with _interrupts_blocked():
             self.process.start()
         theirs.close()

@@ -196,6 +196,18 @@ if __name__ == "__main__":
 """
 
 
+def _blocked(tell):
+    return signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, [])
+
+
+def test_every_worker_is_born_deaf_to_ctrl_c():
+    """The first one too: what starts beside it lifts the block."""
+    with Pool(2) as pool:
+        for n in range(2):
+            pool.start(n, _blocked)
+        assert [ended.result for ended in everything(pool, 2).values()] == [True, True]
+
+
 def test_ctrl_c_reaches_the_parent_only(tmp_path):
     """A terminal sends it to the whole group; the workers say nothing and are gone."""
     script = tmp_path / "script.py"
