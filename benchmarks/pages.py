@@ -11,6 +11,9 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from rich.console import Console
+from rich.table import Table
+
 from benchmarks.results import atomic_write_text
 from rise_agents.workers import available_cores
 
@@ -93,6 +96,31 @@ def csv_text(kind: Any, rows: Sequence[Any]) -> str:
     for row in rows:
         table.writerow([f"{cell:.6g}" if isinstance(cell, float) else cell for cell in astuple(row)])
     return sink.getvalue()
+
+
+def csv_lines(path: Path, kind: Any, what: str) -> list[dict[str, str]]:
+    """The lines of a table of ``what`` that :func:`csv_text` made of ``kind``, by column.
+
+    Raises:
+        ValueError: no such file, or one with other columns.
+    """
+    try:
+        with path.open(newline="") as file:
+            lines = list(csv.DictReader(file))
+    except OSError as error:
+        raise ValueError(f"cannot read {path}: {error.strerror}") from None
+    names = [field.name for field in fields(kind)]
+    if not lines or list(lines[0]) != names:
+        raise ValueError(f"{path} is not a table of {what}: expected the columns {', '.join(names)}")
+    return lines
+
+
+def table_lines(table: Table, width: int, notes: Iterable[str]) -> str:
+    """A table for a terminal, without spaces at the ends of its lines, and notes below."""
+    text = io.StringIO()
+    Console(file=text, width=width, color_system=None).print(table)
+    lines = [line.rstrip() for line in text.getvalue().strip("\n").splitlines()]
+    return "\n".join([*lines, *notes]) + "\n"
 
 
 def machine() -> str:

@@ -14,14 +14,13 @@ from typing import Any
 import numpy as np
 
 from benchmarks.faults import hostile
-from benchmarks.faults.hostile import Marks, Sample
+from benchmarks.faults.hostile import Forger, Marks, Sample
 from benchmarks.faults.measure import Effort, Fault, Findings, Tell
 from benchmarks.faults.training import BENCHMARKED, train
 from rise_agents import AGENTS, agent_class, load_agent
 from rise_agents.checkpoint import CheckpointError
 
 Samples = list[Sample]
-Forger = Callable[[np.random.Generator, Sample, Sample, Marks], bytes]
 NOT_FILES = ("folder", "zero", "fifo", "absent")
 _PORTION = 250  # trials of a process at a time
 _RARE = 1_000  # trials, of which one of each kind is no regular file
@@ -40,10 +39,6 @@ _WRONG: dict[type, tuple[Any, ...]] = {
     str: (*_NEVER, 1, True, None, [], "no such thing", "\x00", f"{hostile.EVIL}:Env-v0"),
     tuple: (*_NEVER, 1, True, None, "64", [], [0], [-1], [1.5], ["64"], [True], [10**30]),
 }
-
-
-def _signed(change: Callable[[np.random.Generator, Sample], bytes]) -> Forger:
-    return lambda rng, sample, other, marks: change(rng, sample)
 
 
 def wrong_values(default: Any) -> tuple[Any, ...]:
@@ -99,21 +94,11 @@ def wrong_entry(rng: np.random.Generator, sample: Sample) -> bytes:
 
 
 FORGERS: dict[str, Forger] = {
-    "bits flipped": lambda rng, sample, other, marks: hostile.flipped(sample.content, rng),
-    "truncated": lambda rng, sample, other, marks: hostile.truncated(sample.content, rng),
-    "extended": lambda rng, sample, other, marks: hostile.extended(sample.content, rng),
-    "spliced": lambda rng, sample, other, marks: hostile.spliced(sample.content, other.content, rng),
-    "foreign file": lambda rng, sample, other, marks: hostile.foreign(rng, sample),
-    "pickle bomb": lambda rng, sample, other, marks: hostile.bombs(rng, marks, sample, "config"),
-    "signed, header": _signed(hostile.headers),
-    "signed, arrays": _signed(hostile.arrays_changed),
-    "signed, arrays of another": lambda rng, sample, other, marks: hostile.archive(
-        other.arrays, sample.header
-    ),
-    "signed, setting": _signed(wrong_setting),
-    "signed, environment": _signed(wrong_env),
-    "signed, agent": _signed(wrong_agent),
-    "signed, entry": _signed(wrong_entry),
+    **hostile.common_forgers("config"),
+    "signed, setting": hostile.signed_with(wrong_setting),
+    "signed, environment": hostile.signed_with(wrong_env),
+    "signed, agent": hostile.signed_with(wrong_agent),
+    "signed, entry": hostile.signed_with(wrong_entry),
 }
 
 

@@ -79,26 +79,12 @@ def wrong_numbers(rng: np.random.Generator, sample: Sample) -> bytes:
     return hostile.archive(arrays, sample.header)
 
 
-def _signed(change: Callable[[np.random.Generator, Sample], bytes]) -> Forger:
-    return lambda rng, sample, other, marks: change(rng, sample)
-
-
 FORGERS: dict[str, Forger] = {
-    "bits flipped": lambda rng, sample, other, marks: hostile.flipped(sample.content, rng),
-    "truncated": lambda rng, sample, other, marks: hostile.truncated(sample.content, rng),
-    "extended": lambda rng, sample, other, marks: hostile.extended(sample.content, rng),
-    "spliced": lambda rng, sample, other, marks: hostile.spliced(sample.content, other.content, rng),
-    "foreign file": lambda rng, sample, other, marks: hostile.foreign(rng, sample),
-    "pickle bomb": lambda rng, sample, other, marks: hostile.bombs(rng, marks, sample, "env"),
-    "signed, header": _signed(hostile.headers),
-    "signed, arrays": _signed(hostile.arrays_changed),
-    "signed, arrays of another": lambda rng, sample, other, marks: hostile.archive(
-        other.arrays, sample.header
-    ),
-    "signed, environment": _signed(wrong_env),
-    "signed, env_kwargs": _signed(wrong_kwargs),
-    "signed, card": _signed(wrong_card),
-    "signed, numbers": _signed(wrong_numbers),
+    **hostile.common_forgers("env"),
+    "signed, environment": hostile.signed_with(wrong_env),
+    "signed, env_kwargs": hostile.signed_with(wrong_kwargs),
+    "signed, card": hostile.signed_with(wrong_card),
+    "signed, numbers": hostile.signed_with(wrong_numbers),
 }
 
 

@@ -303,3 +303,27 @@ def arrays_changed(rng: np.random.Generator, sample: Sample) -> bytes:
     else:
         arrays = {}
     return archive(arrays, sample.header)
+
+
+# From what is random in a trial, a sample, another one and the marks to the bytes of a forged file.
+Forger = Callable[[np.random.Generator, Sample, Sample, Marks], bytes]
+
+
+def signed_with(change: Callable[[np.random.Generator, Sample], bytes]) -> Forger:
+    """A forger that makes ``change`` to a sample and signs it properly."""
+    return lambda rng, sample, other, marks: change(rng, sample)
+
+
+def common_forgers(entry: str) -> dict[str, Forger]:
+    """What may happen to any file of ours; ``entry`` of its description is where a bomb is put."""
+    return {
+        "bits flipped": lambda rng, sample, other, marks: flipped(sample.content, rng),
+        "truncated": lambda rng, sample, other, marks: truncated(sample.content, rng),
+        "extended": lambda rng, sample, other, marks: extended(sample.content, rng),
+        "spliced": lambda rng, sample, other, marks: spliced(sample.content, other.content, rng),
+        "foreign file": lambda rng, sample, other, marks: foreign(rng, sample),
+        "pickle bomb": lambda rng, sample, other, marks: bombs(rng, marks, sample, entry),
+        "signed, header": signed_with(headers),
+        "signed, arrays": signed_with(arrays_changed),
+        "signed, arrays of another": lambda rng, sample, other, marks: archive(other.arrays, sample.header),
+    }

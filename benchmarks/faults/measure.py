@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import multiprocessing
 import shutil
@@ -13,13 +12,13 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.pages import csv_text, reason
+from benchmarks.pages import csv_lines, csv_text, reason
 from benchmarks.results import atomic_write_text
 
 # Told the share that is done and figures of the moment.
@@ -263,13 +262,6 @@ def read_csv(path: Path) -> list[Result]:
     Raises:
         ValueError: no such file, or one with other columns.
     """
-    try:
-        with path.open(newline="") as file:
-            lines: list[dict[str, Any]] = list(csv.DictReader(file))
-    except OSError as error:
-        raise ValueError(f"cannot read {path}: {error.strerror}") from None
-    names = [each.name for each in fields(Result)]
-    if not lines or list(lines[0]) != names:
-        raise ValueError(f"{path} is not a table of faults: expected the columns {', '.join(names)}")
+    lines = csv_lines(path, Result, "faults")
     kinds = {"trials": int, "faults": int, "seed": int, "seconds": float, "share": float}
     return [Result(**{name: kinds.get(name, str)(text) for name, text in line.items()}) for line in lines]

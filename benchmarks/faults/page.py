@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 
 from rich import box
-from rich.console import Console
 from rich.table import Table
 
 from benchmarks.faults.measure import Result
 from benchmarks.faults.rows import ROWS
-from benchmarks.pages import FAULTS, markdown_table
+from benchmarks.pages import FAULTS, markdown_table, table_lines
 
 BLOCK = FAULTS
 _COLUMNS = ("", "Trials", "Looked for", "Found", "Target", "Met")
@@ -32,10 +30,7 @@ def table_text(results: Sequence[Result], width: int = 170) -> str:
         table.add_column(name, justify="right" if place == 1 else "left", no_wrap=place != 2)
     for result in results:
         table.add_row(*(cell.replace("`", "") for cell in cells(result)))
-    text = io.StringIO()
-    Console(file=text, width=width, color_system=None).print(table)
-    lines = [line.rstrip() for line in text.getvalue().strip("\n").splitlines()]
-    return "\n".join([*lines, *(f"{r.name}: {r.note}" for r in results if r.note)]) + "\n"
+    return table_lines(table, width, (f"{r.name}: {r.note}" for r in results if r.note))
 
 
 def markdown(results: Sequence[Result], about: str) -> str:

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import csv
 import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.pages import csv_text
+from benchmarks.pages import csv_lines, csv_text
 from benchmarks.results import atomic_write_text
 
 Side = Callable[[], float]  # does its work once; the figure in the row's unit
@@ -202,14 +201,7 @@ def read_csv(path: Path) -> list[Result]:
     Raises:
         ValueError: no such file, or one with other columns.
     """
-    try:
-        with path.open(newline="") as file:
-            lines = list(csv.DictReader(file))
-    except OSError as error:
-        raise ValueError(f"cannot read {path}: {error.strerror}") from None
-    names = [field.name for field in fields(Result)]
-    if not lines or list(lines[0]) != names:
-        raise ValueError(f"{path} is not a table of speeds: expected the columns {', '.join(names)}")
+    lines = csv_lines(path, Result, "speeds")
     numbers = {"value", "peer_value", "ratio", "ratio_low", "ratio_high"}
     rows = []
     for line in lines:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 
 from rich import box
-from rich.console import Console
 from rich.table import Table
 
-from benchmarks.pages import SPEED, markdown_table
+from benchmarks.pages import SPEED, markdown_table, table_lines
 from benchmarks.speed.measure import Result
 from benchmarks.speed.rows import ROWS
 
@@ -45,10 +43,7 @@ def table_text(results: Sequence[Result], width: int = 140) -> str:
         table.add_column(name, justify="left" if place in (0, 3, 6) else "right", no_wrap=True)
     for result in results:
         table.add_row(*(cell.replace("`", "") for cell in cells(result)))
-    text = io.StringIO()
-    Console(file=text, width=width, color_system=None).print(table)
-    lines = [line.rstrip() for line in text.getvalue().strip("\n").splitlines()]
-    return "\n".join([*lines, *(f"{r.name}: {r.note}" for r in results if r.note)]) + "\n"
+    return table_lines(table, width, (f"{r.name}: {r.note}" for r in results if r.note))
 
 
 def markdown(results: Sequence[Result], about: str, picture: str | None) -> str:
