@@ -10,7 +10,7 @@ import importlib
 import os
 from typing import Any
 
-from rise_agents.agent import Agent, nearest
+from rise_agents.agent import Agent, acting_settings, config_from_dict, nearest
 from rise_envs.streams import checked_seed
 
 __version__ = "0.1.0"
@@ -53,11 +53,23 @@ def make_agent(
     return agent_class(name)(env_id, {} if config is None else config, _seed(seed), device)
 
 
-def load_agent(path: str | os.PathLike[str], env_id: str | None = None, device: str = "cpu") -> Agent:
+def load_agent(
+    path: str | os.PathLike[str],
+    env_id: str | None = None,
+    device: str = "cpu",
+    settings: dict[str, Any] | None = None,
+) -> Agent:
     """A trained agent from a checkpoint (of ``env_id``, if that is given).
+
+    Args:
+        path: of the checkpoint.
+        env_id: a registered environment.
+        device: a torch device.
+        settings: how it acts, laid over what is stored: of the settings that its class names in ``ACTING``.
 
     Raises:
         rise_agents.checkpoint.CheckpointError: unreadable, damaged, or of another environment.
+        ValueError: a setting that does not exist, that is out of range, or that training depended on.
     """
     from rise_agents import checkpoint
 
@@ -69,12 +81,26 @@ def load_agent(path: str | os.PathLike[str], env_id: str | None = None, device: 
         raise checkpoint.CheckpointError(
             path, f"was trained on {env!r}, not {env_id!r}", "train on that environment"
         )
+    if settings:
+        _check_acting(name, settings)
     try:
         _seed(description["seed"])
-        return agent_class(name).from_checkpoint(arrays, description, device)
+        config = {**description["config"], **(settings or {})}
+        return agent_class(name).from_checkpoint(arrays, {**description, "config": config}, device)
     except Exception as error:  # a right digest says who wrote a file, not that it makes sense
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise checkpoint.CheckpointError(path, f"is no whole agent ({reason})", "train it again") from None
+
+
+def _check_acting(name: str, settings: dict[str, Any]) -> None:
+    """Raise ``ValueError`` unless an agent of this name can be told to act so after its training."""
+    kind = agent_class(name)
+    config_from_dict(kind.Config, settings)
+    known = acting_settings(kind)
+    for setting in settings:
+        if setting not in known:
+            told = f"known: {', '.join(sorted(known))}" if known else "it has none"
+            raise ValueError(f"{setting!r} is no setting that a trained {name} acts by; {told}")
 
 
 def _seed(seed: Any) -> int:
