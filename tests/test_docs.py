@@ -24,6 +24,7 @@ from rise_agents import AGENTS, agent_class, readings
 from rise_agents.agent import make_config
 from rise_agents.cloning import CloningConfig
 from rise_agents.experts import EXPERTS
+from rise_agents.filters import FILTERS
 from rise_agents.pcbc import Config as PCBCConfig
 from rise_agents.rise import Config as RiseConfig
 from rise_agents.seeds import SPLITS
@@ -225,6 +226,13 @@ def test_the_table_of_experts_agrees_with_the_registry():
     rows = table("agents.md", "environment", "name", "class")
     assert {(env, name): kind for env, name, kind, _ in rows} == {
         key: path.partition(":")[2] for key, path in EXPERTS.items()
+    }
+
+
+def test_the_table_of_filters_agrees_with_the_registry():
+    rows = table("agents.md", "name", "class", "method")
+    assert {name: kind for name, kind, _ in rows} == {
+        name: path.partition(":")[2] for name, path in FILTERS.items()
     }
 
 
