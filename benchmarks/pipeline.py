@@ -6,7 +6,7 @@ import json
 import platform
 import shlex
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +24,10 @@ from benchmarks.jobs import (
     training_jobs,
     video_jobs,
 )
+from benchmarks.labels import name_rows, noise_label, split_row
 from benchmarks.protocol import Plan, imitates
-from rise_agents import AGENTS, checkpoint, demonstrations
+from benchmarks.results import SummaryRow
+from rise_agents import checkpoint, demonstrations
 from rise_agents.files import sweep
 
 
@@ -57,6 +59,7 @@ def execute(plan: Plan, out: Path, how: How) -> list[Failure]:
     for folder in [out, *(path for path in out.rglob("*") if path.is_dir())]:
         sweep(folder)
     tidy(out)
+    name_rows({name: variant.label for name, variant in plan.variants.items() if variant.label})
     with Display() as display:
         evaluations = evaluation_jobs(plan, out)
         jobs = [*recording_jobs(plan, out), *training_jobs(plan, out, how.device, how.every), *evaluations]
@@ -78,13 +81,33 @@ def _write_results(plan: Plan, out: Path, evaluations: list[Job], command: Seque
     order = list(dict.fromkeys(row for env in plan.envs for row, _ in plan.rows(env)))
     summary = results.summarise(rows, order)
     results.write_summary_csv(out / "summary.csv", summary)
-    level = results.headline_level(summary)
-    plots.save_png(plots.comparison(summary, level), out / "comparison.png")
-    plots.save_png(plots.noise_curve(summary), out / "noise_curve.png")
-    run = {"command": shlex.join(command), "agents": _trained(plan, out)}
+    figures = _draw(summary, plan.noise_models, out)
+    run = {"command": shlex.join(command), "agents": _trained(plan, out), "figures": figures}
     results.atomic_write_text(out / "summary.md", report.summary_markdown(summary, run))
     for env in plan.envs:
         print(report.summary_table_text(summary, env))
+
+
+def _draw(summary: list[SummaryRow], models: Sequence[str], out: Path) -> dict[str, str]:
+    """Draw the figures, those of the first noise model under their usual names; relative path → caption."""
+    level, captions = results.headline_level(summary), {}
+    measured = [model for model in dict.fromkeys(models) if any(r.noise_model == model for r in summary)]
+    for number, model in enumerate(measured):
+        rows = [
+            replace(row, noise_model=model)
+            for row in summary
+            if row.noise_model == model or not row.noise_level
+        ]  # level 0 is the same for all, and measured once
+        mark = f"-{model.replace(':', '_')}" if number else ""
+        for name, figure in (
+            ("comparison.png", plots.comparison(rows, level)),
+            ("noise_curve.png", plots.noise_curve(rows)),
+        ):
+            path = f"{name.removesuffix('.png')}{mark}.png"
+            plots.save_png(figure, out / path)
+            under = f" ({noise_label(model)})" if len(measured) > 1 else ""
+            captions[path] = report.FIGURES[name] + under
+    return captions
 
 
 def _write_failures(path: Path, failures: list[Failure]) -> None:
@@ -97,36 +120,44 @@ def _write_failures(path: Path, failures: list[Failure]) -> None:
 
 
 def _trained(plan: Plan, out: Path) -> dict[str, dict[str, Any]]:
-    """How each agent was trained, in words and numbers, per agent and environment."""
+    """How the agent of each row was trained and acts, in words and numbers, per row and environment."""
     facts: dict[str, dict[str, Any]] = {}
     for env in plan.envs:
-        for agent in [name for name in plan.agents if name in AGENTS]:
-            path = checkpoint_path(plan, env, agent, 0, out).with_suffix(".json")
+        for row in _trained_rows(plan, env):
+            path = checkpoint_path(plan, env, row, 0, out).with_suffix(".json")
             if path.exists():
                 seconds = json.loads(path.read_text())["seconds"]
-                settings = complete_settings(plan, env, agent)
+                settings = complete_settings(plan, env, row)
+                by = "expert" if plan.expert_of(row) == plan.expert else plan.expert_of(row)
                 tried = f"trial in {settings.get('train_env') or 'the environment'}"
-                source = f"{plan.demos:,} expert episodes" if imitates(agent) else tried
+                source = f"{plan.demos:,} {by} episodes" if imitates(plan.agent_of(row)) else tried
                 entry = {"learned from": source, "training time": f"{seconds:.0f} s"}
-                facts.setdefault(agent, {})[env] = {**entry, **settings}
+                facts.setdefault(row, {})[env] = {**entry, **settings}
     return facts
+
+
+def _trained_rows(plan: Plan, env: str) -> list[str]:
+    """The rows of trained agents, each once; what stands before one (a filter) makes it no other agent."""
+    bases = dict.fromkeys(split_row(row)[0] for row, _ in plan.rows(env))
+    return [base for base in bases if plan.agent_of(base)]
 
 
 def _write_run(plan: Plan, out: Path, how: How, failures: list[Failure]) -> None:
     """``run.json``: all that is needed to repeat the run."""
     cards = {}
     for env in plan.envs:
-        folder = demonstrations_folder(plan, env, out)
-        if all((folder / name).exists() for name in (demonstrations.DATA, demonstrations.CARD)):
-            cards[env] = json.loads((folder / demonstrations.CARD).read_text())
+        for expert in dict.fromkeys((plan.expert, *plan.experts(env))):
+            folder = demonstrations_folder(plan, env, out, expert)
+            if all((folder / name).exists() for name in (demonstrations.DATA, demonstrations.CARD)):
+                card = json.loads((folder / demonstrations.CARD).read_text())
+                cards[env if expert == plan.expert else f"{env} by {expert}"] = card
     run = {
         "command": shlex.join(how.command),
         "plan": asdict(plan),
         "settings": {
-            f"{agent}@{env}": complete_settings(plan, env, agent)
+            f"{row}@{env}": complete_settings(plan, env, row)
             for env in plan.envs
-            for agent in plan.agents
-            if agent in AGENTS
+            for row in _trained_rows(plan, env)
         },
         "device": how.device,
         "failed": [
@@ -138,7 +169,7 @@ def _write_run(plan: Plan, out: Path, how: How, failures: list[Failure]) -> None
             env: {
                 f"{row}-seed{seed}": str(checkpoint_path(plan, env, row, seed, out).relative_to(out))
                 for row, seed in plan.rows(env)
-                if row in AGENTS
+                if plan.agent_of(row)
             }
             for env in plan.envs
         },

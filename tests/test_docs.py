@@ -299,7 +299,7 @@ def test_the_table_of_presets_agrees_with_them(preset):
     place = list(PRESETS).index(preset) + 1
     said = {row[0]: row[place] for row in table("benchmark.md", "", *heads)}
     known = PRESETS[preset]
-    plan = make_plan(preset, {}, agents=tuple(AGENTS), envs=tuple(TASKS), noise_model="step")
+    plan = make_plan(preset, {}, agents=tuple(AGENTS), envs=tuple(TASKS), noise_models=("step",))
 
     def setting(agent: str, env: str, field: str) -> int:
         return getattr(make_config(agent_class(agent), env, plan.config(agent, env)), field)

@@ -169,7 +169,7 @@ def test_a_plan_adds_the_user_s_choices_to_the_preset():
         {"rise": {"beta": 0.2}},
         agents=("rise", "expert"),
         envs=(VEHICLE,),
-        noise_model="step",
+        noise_models=("step",),
         episodes=5,
     )
     assert plan.episodes == 5
