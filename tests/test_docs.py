@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.configs import SHIPPED, read
 from benchmarks.protocol import PRESETS, make_plan
 from benchmarks.results import SCHEMA, SummaryRow
 from benchmarks.run import parser
@@ -334,6 +335,25 @@ def test_the_table_of_options_has_every_option_of_the_command():
             assert default == value
         elif isinstance(value, list):
             assert default == " ".join(value)
+
+
+def test_the_table_of_variants_agrees_with_the_shipped_file():
+    found = read([SHIPPED])
+    rows = table("benchmark.md", "variant", "agent", "differs in")
+    assert [row[0] for row in rows] == list(found.variants)
+    for name, agent, differs in rows:
+        variant, settings = found.variants[name], found.layers[0][name]
+        words = [f"{key} {value}" for key, value in settings.items()]
+        words += [f"demonstrations by {variant.expert}"] if variant.expert else []
+        assert (agent, differs) == (variant.agent, ", ".join(words))
+
+
+def test_the_config_file_of_the_page_is_one(tmp_path):
+    (text,) = re.findall(r"```toml\n(.*?)```", (DOCS / "benchmark.md").read_text(), re.DOTALL)
+    path = tmp_path / "mine.toml"
+    path.write_text(text)
+    found = read([path])
+    assert list(found.variants) == ["rise-large"] and next(iter(found.layers[0])) == "rise"
 
 
 def test_the_table_of_seeds_agrees_with_the_splits():
