@@ -20,6 +20,7 @@ AGENTS: dict[str, str] = {
     "rise": "rise_agents.rise:Rise",
     "pcbc": "rise_agents.pcbc:PCBC",
     "cppo": "rise_agents.cppo:CPPO",
+    "rise-belief": "rise_agents.belief.agent:RiseBelief",
 }
 
 

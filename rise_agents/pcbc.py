@@ -10,21 +10,18 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rise_agents import cloning, shapes
+from rise_agents import clone, cloning, shapes
 from rise_agents.agent import Progress, State, make_config, require, silent
-from rise_agents.cloning import ActionUnits, CloningConfig, Eyes, Lesson
+from rise_agents.clone import Clone
+from rise_agents.cloning import ActionUnits, CloningConfig
 from rise_agents.files import StrPath
-from rise_agents.forward import Forward, layers_of, standardised
 from rise_agents.readings import checked_batch
 from rise_agents.resume import Resume
-
-if TYPE_CHECKING:
-    from torch import Tensor, nn
 
 
 @dataclass(frozen=True)
@@ -70,52 +67,13 @@ class PCBC:
 
     def learn(self, source: Any, progress: Progress = silent, resume: Resume | StrPath | None = None) -> PCBC:
         """Clone :class:`rise_agents.demonstrations.Demonstrations`; see :class:`rise_agents.agent.Agent`."""
-        import torch  # here and not above: it takes a second, which who only acts need not spend
-
-        from rise_agents.networks import mlp
-        from rise_agents.stages import to_arrays
-        from rise_agents.training import fit
-
         c = self.config
         lesson = cloning.begin(self, source, progress, resume)
-        data = lesson.data
-        inputs: tuple[Tensor, ...] = (torch.cat((data.robot, data.reading), -1),)
-        policy = mlp(*self._sizes(inputs[0].shape[1])).to(self.device)
-        noisy = NoisyReadings(lesson, c.train_noise, c.n_samples) if c.train_noise else None
-        if noisy:
-            inputs = noisy.raw()
-
-        def loss(*rows: Tensor) -> dict[str, Tensor]:
-            seen = noisy(*rows[:-1]) if noisy else rows[0]
-            return policy_loss(policy, seen, rows[-1], c.loss)
-
-        fit(
-            lesson.stages["policy"],
-            policy,
-            loss,
-            (*inputs, data.action),
-            updates=c.updates,
-            batch_size=c.batch_size,
-            learning_rate=c.learning_rate,
-            generator=lesson.generator,
-            progress=lesson.progress,
-        )
-        return self._use({**lesson.eyes.arrays(), **to_arrays(policy, "policy")})
-
-    def _sizes(self, inputs: int) -> tuple[int, tuple[int, ...], int]:
-        """Inputs, hidden widths and outputs of π(s, g, c)."""
-        return inputs, self.config.hidden, cloning.output_size(self.units.size, self.config.loss)
+        return self._use(clone.train(lesson, c, lesson.progress, c.train_noise, c.n_samples))
 
     def _use(self, arrays: dict[str, NDArray]) -> PCBC:
         self._arrays = arrays
-        self._eyes = eyes = Eyes.from_arrays(self.task, self.config.frame, arrays)
-        first, *rest = layers_of(arrays, "policy")
-        mean, scale = (
-            np.concatenate([getattr(part, name) for part in (eyes.robot, eyes.reading)])
-            for name in ("mean", "scale")
-        )
-        # It acts in the units of inputs and actions, which saves their conversion at every step.
-        self._policy = Forward([standardised(first, mean, scale), *rest[:-1], self.units.answering(rest[-1])])
+        self._clone = Clone(self.task, self.config.frame, self.units, arrays)
         return self
 
     def predict(
@@ -129,7 +87,7 @@ class PCBC:
         if not self._arrays:
             raise cloning.untrained(self.name)
         rows, single = checked_batch(self.task, observation)
-        action = self.units.clip(self._policy(*self._eyes.inputs(rows)))
+        action = self._clone(rows)
         return (action[0] if single else action), None
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -140,48 +98,6 @@ class PCBC:
     def from_checkpoint(cls, arrays: dict[str, NDArray], description: dict[str, Any], device: str) -> PCBC:
         """The agent that :meth:`save` stored; ``ValueError`` if the arrays are not those of its config."""
         agent = cls(description["env"], description["config"], description["seed"], device)
-        sizes = agent._sizes(sum(cloning.input_widths(agent)))
+        sizes = clone.sizes(agent.config, sum(cloning.input_widths(agent)), agent.units.size)
         cloning.check_arrays(agent, arrays, shapes.mlp("policy", *sizes))
         return agent._use(arrays)
-
-
-class NoisyReadings:
-    """What a policy sees of demonstrations whose readings carry fresh noise, drawn anew in every update.
-
-    The noise enters the reading itself, in the world, and the frame is computed from what was read: as in the
-    environment, whatever the frame makes of it.
-
-    Args:
-        lesson: the demonstrations, how they are seen, and the generator to draw from.
-        level: of the noise, in units of the task's ``noise_scale``.
-        copies: M.
-    """
-
-    KEYS = ("observation", "desired_goal", "obstacle")
-
-    def __init__(self, lesson: Lesson, level: float, copies: int) -> None:
-        self.lesson, self.copies = lesson, copies
-        self.deviation = level * np.asarray(lesson.eyes.task.noise_scale)
-
-    def raw(self) -> tuple[Tensor, ...]:
-        """States, goals and true readings of all transitions, (T, ·) each, float64, on the training device."""
-        import torch
-
-        device, parts = self.lesson.data.action.device, self.lesson.demonstrations.observations
-        return tuple(torch.tensor(parts[key], device=device) for key in self.KEYS)
-
-    def __call__(self, *rows: Tensor) -> Tensor:
-        """Robot and reading inputs in standard units, (M, B, R + C), of M noisy copies of raw rows (B, ·)."""
-        import torch
-
-        draws = self.lesson.normal(self.copies, *rows[2].shape).cpu().numpy()
-        repeated = (np.tile(row.cpu().numpy(), (self.copies, 1)) for row in rows)
-        observation = dict(zip(self.KEYS, repeated, strict=True))
-        observation["obstacle"] += self.deviation * draws.reshape(observation["obstacle"].shape)
-        seen = np.concatenate(self.lesson.eyes(observation), -1).reshape(self.copies, len(rows[0]), -1)
-        return torch.from_numpy(seen).to(rows[0].device)
-
-
-def policy_loss(policy: nn.Module, seen: Tensor, action: Tensor, kind: str) -> dict[str, Tensor]:
-    """The imitation loss of actions (B, A) at robot and reading inputs (…, B, R + C)."""
-    return {"loss": cloning.imitation_loss(policy(seen), action, kind)}

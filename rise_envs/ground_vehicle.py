@@ -28,6 +28,14 @@ def _pose(state: Array) -> tuple[Array, Array]:
     return state[..., :2], rotation
 
 
+def _moved(state: Array, action: Array, dt: float) -> Array:
+    """Where the centre is after actions (v, ω): on an arc, which its chord spans."""
+    half = 0.5 * dt * action[..., 1]
+    chord = dt * action[..., 0] * np.sinc(half / np.pi)
+    heading = state[..., None, 2] + half
+    return state[..., None, :2] + chord[..., None] * np.stack((np.cos(heading), np.sin(heading)), -1)
+
+
 def make_spaces(n_obstacles: int, p: Params) -> tuple[spaces.Dict, spaces.Box]:
     """Observation and action space of one vehicle among ``n_obstacles`` discs."""
     reach = p.arena_half + 200 * p.dt * max(p.v_max, -p.v_min)  # nobody drives further in an episode
@@ -84,6 +92,7 @@ class VehicleTask(goals.GoalAPI):
             state_size=3,
             obstacle_speed=p.obstacle_speed,
             redraw_interval=p.redraw_interval,
+            moved=_moved,
         )
 
     @property

@@ -16,6 +16,12 @@ from rise_envs.task import Task
 
 Array = NDArray[np.float64]
 
+STEP = 0.05  # m of commanded displacement per unit of action
+# One step of the hand, fitted by least squares to roll-outs of an expert (5 mm root mean square):
+# displacement = FOLLOW·command + KEEP·velocity·dt. Gravity and saturating motors couple x and z.
+FOLLOW = np.array([[0.65, 0.0, -0.13], [0.0, 0.67, 0.0], [0.13, 0.0, 0.38]])
+KEEP = np.array([[0.31, 0.0, 0.16], [0.0, 0.29, 0.0], [-0.08, 0.0, 0.65]])
+
 
 class PandaTask(goals.GoalAPI):
     """Mixed into the environments: see :class:`rise_envs.safe_panda.SafePandaEnv` for all meanings."""
@@ -48,6 +54,7 @@ class PandaTask(goals.GoalAPI):
             state_size=13,
             obstacle_speed=p.max_speed,
             redraw_interval=p.redraw_interval,
+            moved=_moved,
         )
 
     @property
@@ -59,6 +66,14 @@ class PandaTask(goals.GoalAPI):
 def _pose(state: Array) -> tuple[Array, Array]:
     """The hand's frame: its position, axes parallel to the world's."""
     return state[..., :3], np.broadcast_to(np.eye(3), (*state.shape[:-1], 3, 3))
+
+
+def _moved(state: Array, action: Array, dt: float) -> Array:
+    """Where the hand is one step after actions, by the linear model of this file; targets stay above the table."""
+    hand, velocity = state[..., None, :3], state[..., None, 3:6]
+    command = STEP * action
+    command[..., 2] = np.maximum(command[..., 2], -hand[..., 2])
+    return hand + command @ FOLLOW.T + dt * velocity @ KEEP.T
 
 
 def make_spaces(p: Params) -> tuple[spaces.Dict, spaces.Box]:

@@ -40,6 +40,8 @@ class Task:
         obstacle_speed: greatest speed of a ball (m/s): speeds are drawn from U[0, obstacle_speed], directions
             uniformly.
         redraw_interval: mean time between two draws of a ball's velocity (s).
+        moved: maps states (B, S), K actions for each (B, K, A) and ``dt`` to where the reference point is one step
+            later, (B, K, D): the robot's kinematics, for who may use them.
     """
 
     dim: int
@@ -54,6 +56,7 @@ class Task:
     state_size: int
     obstacle_speed: float
     redraw_interval: float
+    moved: Callable[[Array, Array, float], Array]
 
     @cached_property
     def widths(self) -> dict[str, int]:

@@ -15,16 +15,13 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rise_envs import panda_kinematics as panda
+from rise_envs.panda_task import FOLLOW, KEEP, STEP
 
 Array = NDArray[np.float64]
 
-STEP = 0.05  # m of commanded displacement per unit of action
 DT = 0.04  # s
-# One step of the simulated hand, fitted by least squares to roll-outs of `PandaCBF` (5 mm root mean square):
-# displacement = FOLLOW·command + KEEP·velocity·DT, next velocity·DT = _KICK·command + _CARRY·velocity·DT.
-# Gravity and saturating motors couple x and z.
-FOLLOW = np.array([[0.65, 0.0, -0.13], [0.0, 0.67, 0.0], [0.13, 0.0, 0.38]])
-KEEP = np.array([[0.31, 0.0, 0.16], [0.0, 0.29, 0.0], [-0.08, 0.0, 0.65]])
+# The hand's next velocity, fitted as its displacement (`FOLLOW`, `KEEP`) was:
+# velocity·DT = _KICK·command + _CARRY·velocity·DT.
 _KICK = np.array([[0.35, 0.0, 0.08], [0.0, 0.64, 0.0], [-0.09, 0.0, 0.56]])
 _CARRY = np.array([[-0.02, 0.0, 0.02], [0.0, -0.31, 0.0], [0.10, 0.0, 0.02]])
 _TWIST_GAIN = 0.5  # share of the hand's tilt that one step takes back

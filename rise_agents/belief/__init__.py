@@ -1,0 +1,1 @@
+"""A belief over the obstacles from the sequence of their readings: the agent ``rise-belief``, see :mod:`.agent`."""
