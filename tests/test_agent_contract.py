@@ -20,6 +20,7 @@ BRIEF = {
     "rise": {"updates": 30, "vae_updates": 30, "batch_size": 32, "vae_batch_size": 32},
     "pcbc": {"updates": 30, "batch_size": 32},
     "cppo": {"total_steps": 512, "n_envs": 4, "n_steps": 64, "batch_size": 128},
+    "rise-belief": {"updates": 30, "belief_updates": 30, "belief_rows": 2_000, "belief_batch_size": 128},
 }
 
 

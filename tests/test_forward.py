@@ -67,7 +67,7 @@ def test_layers_are_found_in_order_and_by_their_whole_name():
 def test_pcbc_acts_as_its_network_in_torch(vehicle_demonstrations, loss):
     agent = make_agent("pcbc", VEHICLE, {"updates": 30, "loss": loss}).learn(vehicle_demonstrations)
     observation = vehicle_demonstrations.subsample(200)
-    seen = np.concatenate(agent._eyes(observation), -1)
+    seen = np.concatenate(agent._clone.eyes(observation), -1)
     policy = mlp(seen.shape[1], agent.config.hidden, output_size(2, loss))
     own = {k.removeprefix("policy."): v for k, v in agent._arrays.items() if k.startswith("policy.")}
     policy.load_state_dict({key: torch.from_numpy(value) for key, value in own.items()})

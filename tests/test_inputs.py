@@ -466,6 +466,8 @@ def wrong_values(kind: Any) -> list[Any]:
         return [*always, np.nan, np.inf, -np.inf, "1", 10**400]
     if kind is str:
         return [*always, "nonsense", 3, np.nan]
+    if kind is bool:
+        return [value for value in always if value is not True] + ["False", 0, 1.0]
     assert get_origin(kind) is tuple
     entries = get_args(kind)
     filler = [1 if entries[0] is int else 1.0] * len(entries)

@@ -8,7 +8,7 @@ import torch
 
 from rise_agents import cloning, make_agent, readings
 from rise_agents.agent import silent
-from rise_agents.pcbc import NoisyReadings
+from rise_agents.clone import NoisyReadings
 from rise_agents.resume import Resume
 
 VEHICLE = "RISE-GroundVehicle-v0"

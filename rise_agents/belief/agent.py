@@ -1,4 +1,4 @@
-"""``rise-belief``: RISE's idea carried through time. The latent is a belief over the obstacle, kept from reading to reading.
+"""``rise-belief``: RISE's idea carried through time, with a belief over the obstacle as its latent.
 
 RISE encodes one reading as a distribution and acts on a sample of it. Here the distribution is over what the obstacle
 truly is, it follows from all readings of the episode, and the policy acts with a margin that follows what is left of
@@ -9,12 +9,12 @@ the uncertainty:
    errors of random size and kind (:mod:`.practice`), by the Gaussian likelihood, each term weighted by (σ + 0.01)^½
    (Seitzer et al., "On the pitfalls of heteroscedastic uncertainty estimation", ICLR 2022): without the weight, large
    errors are not learned from.
-3. It acts on a = π(s, g, c̃), where c̃ is μ with a radius that is larger by ``margin`` · √(σ_p² + σ_r²), σ_p the root mean
-   square deviation of a coordinate of the position. Nobody is nearer to an obstacle than any demonstration was: a
+3. It acts on a = π(s, g, c̃), where c̃ is μ with a radius larger by ``margin`` · √(σ_p² + σ_r²), σ_p the root mean square
+   deviation of a coordinate of the position. Nobody is nearer to an obstacle than any demonstration was: a
    belief that says so is moved off, since nothing can be cloned from where no expert has been.
 
-With ``shield`` the action is held to what the robot's known kinematics say of the next step (:mod:`.shield`); without it
-all is learned. The noise level is never told.
+With ``shield`` the action is held to what the robot's known kinematics say of the next step (:mod:`.shield`); without
+it all is learned. The noise level is never told.
 
 Shapes: B batch, N obstacles, D dimensions, C = 2D + 1 channels of an obstacle.
 """
@@ -92,7 +92,7 @@ class RiseBelief:
     # Margins chosen on validation scenarios: where the way round an obstacle is short, as for the arm, less is needed.
     PRESETS: ClassVar[dict[str, dict[str, Any]]] = {
         "RISE-GroundVehicle-v0": {"margin": 2.0},
-        "RISE-SafePanda-v0": {"hidden": (256, 256), "frame": "body"},
+        "RISE-SafePanda-v0": {"margin": 0.5, "hidden": (256, 256), "frame": "body"},
     }
     ACTING: ClassVar[frozenset[str]] = frozenset({"margin", "shield"})
     learns_from = "demonstrations"
@@ -132,8 +132,9 @@ class RiseBelief:
 
         c = self.config
         rows = practise(self.task, lesson.demonstrations, c.memories, c.belief_rows, self.seed)
-        units = Standardiser.fit(rows.inputs.astype(np.float64))
-        parts = (units(rows.inputs), *rows.estimates, rows.truth)
+        inputs = rows.inputs.astype(np.float64)
+        units = Standardiser.fit(inputs)
+        parts = (units(inputs), *rows.estimates, rows.truth)
         data = [torch.from_numpy(np.ascontiguousarray(part)).to(self.device) for part in parts]
         network = mlp(*self._sizes()).to(self.device)
         scale = torch.tensor(self.scale, dtype=torch.float32, device=self.device)
@@ -202,7 +203,9 @@ class RiseBelief:
         task, memories, batch = self.task, self.config.memories, len(rows["desired_goal"])
         origin, rotation, sums, steps = self._begun(rows, state, episode_start)
         n, d = task.n_obstacles, task.dim
-        frame = Frame(np.repeat(origin, n, 0), np.repeat(rotation, n, 0)) if n > 1 else Frame(origin, rotation)
+        frame = (
+            Frame(np.repeat(origin, n, 0), np.repeat(rotation, n, 0)) if n > 1 else Frame(origin, rotation)
+        )
         reading = frame.readings(task, rows["obstacle"].reshape(batch * n, -1))
         sums = history.remembered(sums.reshape(batch * n, *sums.shape[2:]), reading, task.dt, memories)
         steps = steps + 1.0

@@ -33,7 +33,7 @@ class Evidence(NamedTuple):
     """What the memories say of the present step.
 
     Attributes:
-        count: sum of the weights, (B, L).
+        weight: sum of the weights, (B, L).
         carried: mean position, carried on to now by the mean velocity, (B, L, D).
         fitted: the least-squares line through the positions, now, (B, L, D).
         slope: its slope; the mean velocity while there is one reading, (B, L, D).
@@ -42,7 +42,7 @@ class Evidence(NamedTuple):
         scatter: deviation of positions about the line, of velocities and of radii about their means, (B, L, 3).
     """
 
-    count: Array
+    weight: Array
     carried: Array
     fitted: Array
     slope: Array

@@ -115,7 +115,8 @@ def inputs(task: Task, reading: Readings, seen: Evidence, steps: Array, goal: Ar
     differences = (
         (seen.carried - now) / metre,
         (seen.fitted - now) / metre,
-        (seen.slope - seen.velocity) / speed,  # readings of velocity that contradict the motion betray an error
+        (seen.slope - seen.velocity)
+        / speed,  # readings of velocity that contradict the motion betray an error
         (seen.velocity - reading.velocity[:, None]) / speed,
         ((seen.radius - reading.radius[:, None]) / size)[..., None],
     )
@@ -126,7 +127,7 @@ def inputs(task: Task, reading: Readings, seen: Evidence, steps: Array, goal: Ar
         (
             *flat,
             scatter.reshape(len(now), -1),
-            np.log(seen.count),
+            np.log(seen.weight),
             np.log(steps)[:, None],
             reading.position / metre,
             place / metre,

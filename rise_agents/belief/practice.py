@@ -9,6 +9,7 @@ Shapes: E sequences, T steps, N balls, D dimensions, C = 2D + 1 channels.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -42,7 +43,7 @@ class Practice(NamedTuple):
 
 def errors(rng: np.random.Generator, sequences: int, steps: int, scale: Array, dim: int) -> Array:
     """Errors of readings, (E, T, C), in the units of ``scale`` (C,)."""
-    white = np.exp(rng.uniform(*np.log(WHITE), sequences))
+    white = np.exp(rng.uniform(math.log(WHITE[0]), math.log(WHITE[1]), sequences))
     white[rng.random(sequences) < CLEAN] = 0.0
     bias = rng.uniform(0.0, BIAS, sequences)
     bias[rng.random(sequences) < UNBIASED] = 0.0
@@ -86,7 +87,9 @@ def _block(
     """Rows of some episodes, each ball of which is a sequence."""
     first, lengths = d.offsets[:-1][episodes], np.diff(d.offsets)[episodes]
     steps = int(lengths.max())
-    rows = first[:, None] + np.minimum(np.arange(steps), lengths[:, None] - 1)  # (E, T); past the end: the last
+    rows = first[:, None] + np.minimum(
+        np.arange(steps), lengths[:, None] - 1
+    )  # (E, T); past the end: the last
     state, goal = d.observations["observation"][first], d.observations["desired_goal"][first]
     n, channels = task.n_obstacles, 2 * task.dim + 1
     frame = Frame.of(task, *(np.repeat(part, n, 0) for part in (state, goal)))
@@ -104,7 +107,9 @@ def _block(
             continue
         seen = history.evidence(sums[kept], task.dim)
         reading = Readings(*(part[kept] for part in reading))
-        truth = np.concatenate([part.reshape(len(kept), -1) for part in _kept(frame, task, true[:, step], kept)], -1)
+        truth = np.concatenate(
+            [part.reshape(len(kept), -1) for part in _kept(frame, task, true[:, step], kept)], -1
+        )
         x = posterior.inputs(task, reading, seen, np.full(len(kept), step + 1.0), goal[kept])
         found.append((x, *posterior.estimates(reading, seen), truth))
     parts = [np.concatenate(column).astype(np.float32) for column in zip(*found, strict=True)]

@@ -56,7 +56,9 @@ class Shield:
         step = -(-len(demonstrations.actions) // len(d["obstacle"]))
         actions = demonstrations.actions[::step]
         now = _clearance(task, task.pose(d["observation"])[0][:, None], d["obstacle"], 0.0)[:, 0]
-        then = _clearance(task, task.moved(d["observation"], actions[:, None], task.dt), d["obstacle"], task.dt)[:, 0]
+        then = _clearance(
+            task, task.moved(d["observation"], actions[:, None], task.dt), d["obstacle"], task.dt
+        )[:, 0]
         order = np.array_split(np.argsort(now, kind="stable"), BINS)
         middle = [np.median(now[part]) if len(part) else now.max() for part in order]
         floor = [np.quantile(then[part], QUANTILE) if len(part) else then.min() for part in order]
@@ -67,7 +69,9 @@ class Shield:
         task, state, c = self.task, rows["observation"], rows["obstacle"]
         now = _clearance(task, task.pose(state)[0][:, None], c, 0.0)[:, 0]
         floor = np.interp(now, self.clearance, self.floor)
-        then = _clearance(task, task.moved(state, action[:, None].astype(np.float64), task.dt), c, task.dt)[:, 0]
+        then = _clearance(task, task.moved(state, action[:, None].astype(np.float64), task.dt), c, task.dt)[
+            :, 0
+        ]
         low = np.flatnonzero(then < floor)
         if not low.size:
             return action
