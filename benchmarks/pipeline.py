@@ -5,12 +5,11 @@ from __future__ import annotations
 import json
 import platform
 import shlex
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks import plots, report, results
+from benchmarks import report, results
 from benchmarks.display import Display
 from benchmarks.executors import Failure, run_jobs
 from benchmarks.jobs import (
@@ -65,25 +64,18 @@ def execute(plan: Plan, out: Path, how: How) -> list[Failure]:
         failures = run_jobs(jobs, how.workers, display.watch, display.say)
     _write_failures(out / "failures.log", failures)
     _write_run(plan, out, how, failures)
-    _write_results(plan, out, evaluations, how.command)
+    _write_results(out, evaluations)
     return failures
 
 
-def _write_results(plan: Plan, out: Path, evaluations: list[Job], command: Sequence[str]) -> None:
+def _write_results(out: Path, evaluations: list[Job]) -> None:
     """Everything that is computed from the rows of episodes."""
     parts = [job.output for job in evaluations if job.output.exists()]
     if not parts:
         return
-    rows = results.merge(parts, out / "episodes.parquet")
-    order = list(dict.fromkeys(row for env in plan.envs for row, _ in plan.rows(env)))
-    summary = results.summarise(rows, order)
-    results.write_summary_csv(out / "summary.csv", summary)
-    level = results.headline_level(summary)
-    plots.save_png(plots.comparison(summary, level), out / "comparison.png")
-    plots.save_png(plots.noise_curve(summary), out / "noise_curve.png")
-    run = {"command": shlex.join(command), "agents": _trained(plan, out)}
-    results.atomic_write_text(out / "summary.md", report.summary_markdown(summary, run))
-    for env in plan.envs:
+    rows = results.merge(parts, out / report.EPISODES)
+    summary = report.publish(rows, report.read_run(out), out)
+    for env in dict.fromkeys(row.env for row in summary):
         print(report.summary_table_text(summary, env))
 
 
@@ -142,8 +134,10 @@ def _write_run(plan: Plan, out: Path, how: How, failures: list[Failure]) -> None
             }
             for env in plan.envs
         },
+        "rows": list(dict.fromkeys(row for env in plan.envs for row, _ in plan.rows(env))),
+        "training": _trained(plan, out),
         "versions": checkpoint.versions(),
         "python": platform.python_version(),
         "platform": platform.platform(),
     }
-    results.atomic_write_text(out / "run.json", json.dumps(run, indent=2, sort_keys=True) + "\n")
+    results.atomic_write_text(out / report.RECORD, json.dumps(run, indent=2) + "\n")

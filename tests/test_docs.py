@@ -16,10 +16,11 @@ import numpy as np
 import pytest
 
 from benchmarks.protocol import PRESETS, make_plan
-from benchmarks.results import SCHEMA, SummaryRow
+from benchmarks.results import SCHEMA
 from benchmarks.run import parser
 from benchmarks.speed.page import BLOCK
 from benchmarks.speed.rows import ROWS
+from benchmarks.tables import ComparisonRow, SummaryRow
 from rise_agents import AGENTS, agent_class, readings
 from rise_agents.agent import make_config
 from rise_agents.cloning import CloningConfig
@@ -333,6 +334,7 @@ def test_the_table_of_seeds_agrees_with_the_splits():
 def test_the_tables_of_columns_agree_with_the_files():
     assert columns_after("benchmark.md", "`episodes.parquet`:") == SCHEMA.names
     assert columns_after("benchmark.md", "`summary.csv` (") == [field.name for field in fields(SummaryRow)]
+    assert columns_after("benchmark.md", "`comparisons.csv` (") == [f.name for f in fields(ComparisonRow)]
 
 
 # --- performance -----------------------------------------------------------------------------------------------
