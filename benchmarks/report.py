@@ -62,10 +62,10 @@ training seed, and where all or no episodes succeeded.\
 """
 _DIFFERENCES = """\
 Differences are of the same scenarios and training seeds, in percentage points; in brackets: 95 % intervals \
-of a bootstrap that draws {} anew. p: exact McNemar test on the episodes, of these trained policies, \
-Holm-corrected over all comparisons of the task (`comparisons.csv`); of several training seeds it can be small \
-where the interval, which allows for training anew, holds 0.\
+of a bootstrap that draws {} anew, each for itself. p: exact McNemar test on the episodes, of these trained \
+policies, Holm-corrected over all comparisons of the task (`comparisons.csv`).\
 """
+_SURE = " It can be small where the interval, which allows for training anew, holds 0."
 _EXAMPLES = """\
 examples:
   python -m benchmarks.report runs/quick                              make its tables and figures again
@@ -113,8 +113,9 @@ def summary_markdown(summary: Sequence[SummaryRow], run: Mapping[str, Any]) -> s
     for env in envs:
         blocks += _findings(_rows_of(summary, env))
     if any(row.against for row in summary):
-        drawn = "training seeds and scenarios" if several_seeds(summary) else "scenarios"
-        blocks.append(_DIFFERENCES.format(drawn))
+        seeds = several_seeds(summary)
+        drawn = "training seeds and scenarios" if seeds else "scenarios"
+        blocks.append(_DIFFERENCES.format(drawn) + _SURE * seeds)
     for path, caption in run.get("figures", FIGURES).items():
         blocks.append(f"{'!' if path.endswith('.png') else ''}[{caption}]({path})")
     blocks += ["## Tables", _MEANING + (_SEVERAL_SEEDS if several_seeds(summary) else _ONE_SEED)]
@@ -190,7 +191,7 @@ def _claim(row: SummaryRow) -> str:
     reach = _difference(row.reach_diff, row.reach_diff_low, row.reach_diff_high, row.reach_diff_p)
     other = agent_label(row.agent)
     return (
-        f"{agent_label(row.against)} kept {safety[0]} episodes safe than {other} {safety[1]} "
+        f"{agent_label(row.against)} kept {safety[0]} episodes safe than {other} {safety[1]}, "
         f"and reached the goal without collision in {reach[0]} {reach[1]}."
     )
 

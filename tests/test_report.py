@@ -133,13 +133,13 @@ def test_page_states_how_the_first_agent_differs_from_every_other():
         [*summary, row(level=0.0), row(agent="pcbc", level=0.0, against=AHEAD)], RUN
     )
     assert (
-        "\n\n- RISE kept 9.9 points more episodes safe than PC-BC [6.1, 13.6] (p < 0.001) and reached the goal "
+        "\n\n- RISE kept 9.9 points more episodes safe than PC-BC [6.1, 13.6] (p < 0.001), and reached the goal "
         "without collision in 10.2 points more [6.4, 14.0] (p = 0.012).\n"
-        "- RISE kept 2.0 points fewer episodes safe than Expert (cbf) [−3.9, −0.1] (p = 0.04) and reached the goal "
+        "- RISE kept 2.0 points fewer episodes safe than Expert (cbf) [−3.9, −0.1] (p = 0.04), and reached the goal "
         "without collision in 0.0 points more [−1.2, 1.2], no difference that these episodes can show (p = 1).\n\n"
     ) in page
     assert page.count("RISE kept") == 3  # one rate, two claims: nothing of level 0
-    assert "exact McNemar test" in page and "draws scenarios anew" in page
+    assert "exact McNemar test" in page and "draws scenarios anew, each for itself" in page
     assert "McNemar" not in report.summary_markdown([row()], RUN)
 
 
@@ -172,7 +172,7 @@ def test_page_names_the_intervals_in_its_brackets():
     assert (
         "In brackets: 95 % intervals of a bootstrap that draws training seeds and scenarios anew" in several
     )
-    assert "of a bootstrap that draws training seeds and scenarios anew. p:" in several
+    assert "of a bootstrap that draws training seeds and scenarios anew, each for itself. p:" in several
 
 
 @pytest.mark.parametrize(
