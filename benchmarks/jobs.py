@@ -18,7 +18,7 @@ from benchmarks import results
 from benchmarks.policies import make_policy
 from benchmarks.protocol import Plan, Scenarios, digest, imitates
 from benchmarks.videos import record
-from rise_agents import AGENTS, __version__, agent_class, demonstrations, make_agent
+from rise_agents import AGENTS, __version__, agent_class, checkpoint, demonstrations, make_agent, pretrained
 from rise_agents.agent import Progress, config_to_dict, make_config
 from rise_agents.demonstrations import recording
 from rise_agents.resume import Resume
@@ -55,17 +55,22 @@ def demonstrations_folder(plan: Plan, env: str, out: Path) -> Path:
 
 def checkpoint_path(plan: Plan, env: str, agent: str, seed: int, out: Path) -> Path:
     """Where a trained agent of a plan lies."""
+    if plan.pretrained:
+        return pretrained.file_of(agent, env)
     source = [plan.expert, plan.demos] if imitates(agent) else []
     mark = digest(__version__, env, agent, seed, complete_settings(plan, env, agent), source)
     return out / "agents" / env / f"{agent}-seed{seed}-{mark}.rise"
 
 
 def complete_settings(plan: Plan, env: str, agent: str) -> dict[str, Any]:
-    """All settings of a trained agent, the plan's and its own defaults.
+    """All settings of a trained agent, the plan's and its own defaults; of a shipped one those it was trained with.
 
     Raises:
         ValueError: one is unknown or out of range.
+        CheckpointError: a shipped agent cannot be used.
     """
+    if plan.pretrained:
+        return checkpoint.load(pretrained.find(agent, env))[1]["config"]
     return config_to_dict(make_config(agent_class(agent), env, plan.config(agent, env)))
 
 
@@ -73,7 +78,7 @@ def recording_jobs(plan: Plan, out: Path) -> list[Job]:
     """For each environment in which somebody imitates: a job per piece of demonstrations, one to put them together."""
     jobs = []
     for env in plan.envs:
-        if not any(agent in AGENTS and imitates(agent) for agent in plan.agents):
+        if not any(plan.learns_from_expert(agent) for agent in plan.agents):
             continue
         folder = demonstrations_folder(plan, env, out)
         output, parts = folder / demonstrations.DATA, folder / PARTS
@@ -94,7 +99,7 @@ def training_jobs(plan: Plan, out: Path, device: str, every: float) -> list[Job]
     jobs = []
     for env in plan.envs:
         for agent, seed in plan.rows(env):
-            if agent not in AGENTS:
+            if agent not in AGENTS or plan.pretrained:
                 continue
             folder = demonstrations_folder(plan, env, out)
             clones = imitates(agent)
@@ -132,8 +137,16 @@ def evaluation_jobs(plan: Plan, out: Path) -> list[Job]:
                 for part in plan.chunks(env):
                     arguments: dict[str, Any] = {"env": env, "row": row, "seed": seed, "checkpoint": trained}
                     arguments |= {"noise_model": plan.noise_model, "noise_level": level, "scenarios": part}
-                    source = trained.name if trained else __version__
-                    mark = digest(env, row, seed, source, plan.noise_model, level, part.start, part.count)
+                    mark = digest(
+                        env,
+                        row,
+                        seed,
+                        _source(plan, trained),
+                        plan.noise_model,
+                        level,
+                        part.start,
+                        part.count,
+                    )
                     output = (
                         out
                         / "parts"
@@ -157,21 +170,29 @@ def video_jobs(plan: Plan, out: Path) -> list[Job]:
             seeds = [int(s) for s in Scenarios(0, min(plan.clips, plan.episodes)).seeds()]
             arguments: dict[str, Any] = {"env": env, "row": row, "checkpoint": trained, "seeds": seeds}
             arguments |= {"noise_model": plan.noise_model, "noise_level": level}
-            mark = digest(env, row, trained.name if trained else __version__, plan.noise_model, level, seeds)
+            mark = digest(env, row, _source(plan, trained), plan.noise_model, level, seeds)
             output = out / "videos" / f"{env}-{row}-{mark}.mp4"
             needs = (trained,) if trained else ()
             jobs.append(Job(f"draw {row} on {env}", record, arguments, output, needs, weight=2.0))
     return jobs
 
 
+def _source(plan: Plan, trained: Path | None) -> str:
+    """What stands for a policy in the names of its results."""
+    if trained is None:
+        return __version__
+    # The name of a shipped file says nothing of its weights, which may be other ones in the next version.
+    return pretrained.sha256(trained) if plan.pretrained else trained.name
+
+
 def check_settings(plan: Plan) -> None:
-    """Raise ``ValueError`` if a setting of a trained agent is unknown or out of range."""
+    """Raise ``ValueError`` if a setting of a trained agent is unknown or out of range, or a shipped one is damaged."""
     for env in plan.envs:
         for agent in plan.agents:
             if agent in AGENTS:
                 try:
                     complete_settings(plan, env, agent)
-                except (TypeError, ValueError) as error:
+                except (TypeError, ValueError, checkpoint.CheckpointError) as error:
                     raise ValueError(f"settings of {agent}: {error}") from None
 
 

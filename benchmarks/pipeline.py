@@ -24,7 +24,7 @@ from benchmarks.jobs import (
     video_jobs,
 )
 from benchmarks.protocol import Plan, imitates
-from rise_agents import AGENTS, checkpoint, demonstrations
+from rise_agents import AGENTS, checkpoint, demonstrations, pretrained
 from rise_agents.files import sweep
 
 
@@ -94,7 +94,10 @@ def _trained(plan: Plan, out: Path) -> dict[str, dict[str, Any]]:
     for env in plan.envs:
         for agent in [name for name in plan.agents if name in AGENTS]:
             path = checkpoint_path(plan, env, agent, 0, out).with_suffix(".json")
-            if path.exists():
+            if plan.pretrained:
+                entry = {"learned from": "before: the weights come with the package"}
+                facts.setdefault(agent, {})[env] = {**entry, **complete_settings(plan, env, agent)}
+            elif path.exists():
                 seconds = json.loads(path.read_text())["seconds"]
                 settings = complete_settings(plan, env, agent)
                 tried = f"trial in {settings.get('train_env') or 'the environment'}"
@@ -104,12 +107,21 @@ def _trained(plan: Plan, out: Path) -> dict[str, dict[str, Any]]:
     return facts
 
 
+def _told(trained: Path, plan: Plan, out: Path) -> str:
+    """A checkpoint as ``run.json`` names it."""
+    if plan.pretrained:
+        return f"{trained.name} of rise_agents.pretrained, SHA-256 {pretrained.sha256(trained)}"
+    return str(trained.relative_to(out))
+
+
 def _write_run(plan: Plan, out: Path, how: How, failures: list[Failure]) -> None:
     """``run.json``: all that is needed to repeat the run."""
     cards = {}
     for env in plan.envs:
         folder = demonstrations_folder(plan, env, out)
-        if all((folder / name).exists() for name in (demonstrations.DATA, demonstrations.CARD)):
+        if not plan.pretrained and all(
+            (folder / name).exists() for name in (demonstrations.DATA, demonstrations.CARD)
+        ):
             cards[env] = json.loads((folder / demonstrations.CARD).read_text())
     run = {
         "command": shlex.join(how.command),
@@ -128,7 +140,7 @@ def _write_run(plan: Plan, out: Path, how: How, failures: list[Failure]) -> None
         "demonstrations": cards,
         "agents": {
             env: {
-                f"{row}-seed{seed}": str(checkpoint_path(plan, env, row, seed, out).relative_to(out))
+                f"{row}-seed{seed}": _told(checkpoint_path(plan, env, row, seed, out), plan, out)
                 for row, seed in plan.rows(env)
                 if row in AGENTS
             }

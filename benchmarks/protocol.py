@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 from benchmarks.labels import REFERENCES
-from rise_agents import AGENTS, agent_class
+from rise_agents import AGENTS, agent_class, pretrained
 from rise_agents.agent import nearest
 from rise_agents.experts import expert_names
 from rise_agents.rollout import is_batched_env
@@ -90,6 +90,8 @@ PRESETS = {
 class Plan:
     """One run of the benchmark, complete: what ``run.json`` stores and what every result follows from.
 
+    With ``pretrained`` nobody is trained: the agents are those that come with the package.
+
     Raises:
         ValueError: an unknown name (with the nearest known one) or a number out of range.
     """
@@ -104,6 +106,7 @@ class Plan:
     clips: int = 3
     expert: str = "mixture"
     settings: dict[str, dict[str, Any]] = field(default_factory=dict)
+    pretrained: bool = False
 
     def __post_init__(self) -> None:
         if not (self.agents and self.envs and self.noise_levels):
@@ -124,17 +127,34 @@ class Plan:
             agent, _, env = name.partition("@")
             _known("agent", agent, AGENTS)
             _known("environment", env or next(iter(ENVS)), ENVS)
+        self._check_pretrained()
         for (
             env
         ) in self.envs:  # last: whether an agent imitates says its class, which takes a second to import
             if self.expert in expert_names(env):
                 continue
-            if any(name == "expert" or (name in AGENTS and imitates(name)) for name in self.agents):
+            if any(name == "expert" or self.learns_from_expert(name) for name in self.agents):
                 _known("expert", self.expert, expert_names(env))
+
+    def _check_pretrained(self) -> None:
+        if not self.pretrained:
+            return
+        if self.seeds != 1 or self.settings:
+            raise ValueError(
+                "agents that come with the package are trained: they take neither seeds nor settings"
+            )
+        for env in self.envs:
+            for agent in self.agents:
+                if agent in AGENTS:
+                    pretrained.find(agent, env)
 
     def config(self, agent: str, env: str) -> dict[str, Any]:
         """The settings of an agent in an environment that differ from its defaults."""
         return {**self.settings.get(agent, {}), **self.settings.get(f"{agent}@{env}", {})}
+
+    def learns_from_expert(self, name: str) -> bool:
+        """Whether somebody of this name is trained in this run, on demonstrations."""
+        return not self.pretrained and name in AGENTS and imitates(name)
 
     def rows(self, env: str) -> list[tuple[str, int]]:
         """(row name, training seed) of everything that is evaluated in an environment."""
@@ -181,6 +201,8 @@ def make_plan(preset: str, settings: dict[str, dict[str, Any]], **chosen: Any) -
     merged = {name: dict(entries) for name, entries in base.settings.items()}
     for name, entries in settings.items():
         merged[name] = {**merged.get(name, {}), **entries}
+    if chosen.get("pretrained"):  # whose settings are stored with their weights
+        values["seeds"], merged = chosen.get("seeds") or 1, settings
     return Plan(**values, settings=merged)
 
 

@@ -18,6 +18,7 @@ from rise_agents.files import StrPath
 from rise_agents.forward import Forward, layers_of, standardised
 from rise_agents.readings import checked_batch
 from rise_agents.resume import Resume
+from rise_agents.search import EVERYWHERE, Space
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -38,6 +39,7 @@ class PCBC:
     name = "pcbc"
     Config = Config
     PRESETS: ClassVar[dict[str, dict[str, Any]]] = {}
+    SEARCH: ClassVar[dict[str, Space]] = {EVERYWHERE: cloning.SEARCH}
     learns_from = "demonstrations"
     evaluate_deterministic = True
 

@@ -21,6 +21,7 @@ from benchmarks.run import parser
 from benchmarks.speed.page import BLOCK
 from benchmarks.speed.rows import ROWS
 from benchmarks.tables import ComparisonRow, SummaryRow
+from benchmarks.tune.__main__ import parser as tune_parser
 from rise_agents import AGENTS, agent_class, readings
 from rise_agents.agent import make_config
 from rise_agents.cloning import CloningConfig
@@ -315,9 +316,12 @@ def test_the_table_of_presets_agrees_with_them(preset):
     assert not said
 
 
-def test_the_table_of_options_has_every_option_of_the_command():
-    actions = {action.option_strings[-1]: action for action in parser()._actions}
-    rows = table("benchmark.md", "option", "default")
+@pytest.mark.parametrize(
+    ("head", "command"), [("option", parser()), ("option of the search", tune_parser())], ids=["run", "tune"]
+)
+def test_the_table_of_options_has_every_option_of_the_command(head, command):
+    actions = {action.option_strings[-1]: action for action in command._actions}
+    rows = table("benchmark.md", head, "default")
     assert {row[0] for row in rows} == set(actions) - {"--help"}
     for option, default, _ in rows:
         value = actions[option].default
@@ -325,6 +329,8 @@ def test_the_table_of_options_has_every_option_of_the_command():
             assert default == value
         elif isinstance(value, list):
             assert default == " ".join(value)
+        elif value is not None and not isinstance(value, bool):
+            assert default == f"{value:g}" if isinstance(value, float | int) else str(value)
 
 
 def test_the_table_of_seeds_agrees_with_the_splits():
