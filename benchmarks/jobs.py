@@ -10,20 +10,22 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from benchmarks import results
+from benchmarks.labels import TRUE, agent_label, split_row
 from benchmarks.policies import make_policy
 from benchmarks.protocol import Plan, Scenarios, digest, imitates
 from benchmarks.videos import record
-from rise_agents import AGENTS, __version__, agent_class, checkpoint, demonstrations, make_agent, pretrained
-from rise_agents.agent import Progress, config_to_dict, make_config
+from rise_agents import __version__, agent_class, checkpoint, demonstrations, make_agent, pretrained
+from rise_agents.agent import Progress, acting_settings, config_to_dict, make_config
 from rise_agents.demonstrations import recording
 from rise_agents.resume import Resume
 from rise_agents.rollout import rollout
 
+_Actor = tuple[list[Any], dict[str, Any]]  # see _actor
 PARTS = "parts"  # folder for the pieces of demonstrations that are being recorded
 
 
@@ -48,73 +50,99 @@ class Job:
     weight: float = 1.0
 
 
-def demonstrations_folder(plan: Plan, env: str, out: Path) -> Path:
-    """Where the demonstrations of a plan lie."""
-    return out / "demonstrations" / f"{env}-{digest(__version__, env, plan.expert, plan.demos)}"
+def demonstrations_folder(plan: Plan, env: str, out: Path, expert: str = "") -> Path:
+    """Where the demonstrations of an expert lie: the plan's, if no other is named."""
+    return out / "demonstrations" / f"{env}-{digest(__version__, env, expert or plan.expert, plan.demos)}"
 
 
-def checkpoint_path(plan: Plan, env: str, agent: str, seed: int, out: Path) -> Path:
-    """Where a trained agent of a plan lies."""
+def checkpoint_path(plan: Plan, env: str, row: str, seed: int, out: Path) -> Path:
+    """Where the trained agent of a row lies; rows whose training is the same share it."""
     if plan.pretrained:
-        return pretrained.file_of(agent, env)
-    source = [plan.expert, plan.demos] if imitates(agent) else []
-    mark = digest(__version__, env, agent, seed, complete_settings(plan, env, agent), source)
+        return plan.shipped(row, env)
+    agent = plan.agent_of(row)
+    source = [plan.expert_of(row), plan.demos] if imitates(agent) else []
+    mark = digest(__version__, env, agent, seed, training_settings(plan, env, row), source)
     return out / "agents" / env / f"{agent}-seed{seed}-{mark}.rise"
 
 
-def complete_settings(plan: Plan, env: str, agent: str) -> dict[str, Any]:
-    """All settings of a trained agent, the plan's and its own defaults; of a shipped one those it was trained with.
+def complete_settings(plan: Plan, env: str, row: str) -> dict[str, Any]:
+    """All settings of a row's agent, the plan's and its own defaults; of a shipped one those it was trained with.
 
     Raises:
         ValueError: one is unknown or out of range.
         CheckpointError: a shipped agent cannot be used.
     """
-    if plan.pretrained:
-        return checkpoint.load(pretrained.find(agent, env))[1]["config"]
-    return config_to_dict(make_config(agent_class(agent), env, plan.config(agent, env)))
+    kind, chosen = agent_class(plan.agent_of(row)), plan.config(row, env)
+    if not plan.pretrained:
+        return config_to_dict(make_config(kind, env, chosen))
+    path = plan.shipped(row, env)
+    stored = config_to_dict(make_config(kind, env, checkpoint.load(path)[1]["config"]))
+    settings = config_to_dict(make_config(kind, env, {**stored, **chosen}))
+    acting = acting_settings(kind)
+    for name, value in stored.items():
+        if settings[name] != value and name not in acting:
+            free = f"only {', '.join(sorted(acting))} can be chosen" if acting else "none can be chosen"
+            raise ValueError(f"{path.name} was trained with {name} = {value}, not {settings[name]}: {free}")
+    return settings
+
+
+def training_settings(plan: Plan, env: str, row: str) -> dict[str, Any]:
+    """All settings that the training of a row's agent depends on."""
+    settings, acting = complete_settings(plan, env, row), acting_settings(agent_class(plan.agent_of(row)))
+    return {key: value for key, value in settings.items() if key not in acting}
+
+
+def how_it_acts(plan: Plan, env: str, row: str) -> dict[str, Any]:
+    """All settings by which a row's agent acts; none for what is not trained."""
+    agent = plan.agent_of(row)
+    if not agent:
+        return {}
+    acting = acting_settings(agent_class(agent))
+    return {key: value for key, value in complete_settings(plan, env, row).items() if key in acting}
 
 
 def recording_jobs(plan: Plan, out: Path) -> list[Job]:
-    """For each environment in which somebody imitates: a job per piece of demonstrations, one to put them together."""
+    """For each expert from whom somebody learns: a job per piece of demonstrations, one to put them together."""
     jobs = []
     for env in plan.envs:
-        if not any(plan.learns_from_expert(agent) for agent in plan.agents):
-            continue
-        folder = demonstrations_folder(plan, env, out)
-        output, parts = folder / demonstrations.DATA, folder / PARTS
-        recorded = {"env": env, "expert": plan.expert, "episodes": plan.demos}
-        count, pieces = recording.chunk_size(plan.demos), []
-        if not output.exists():  # else they are not needed, and gone
-            for start in range(0, plan.demos, count):
-                arguments = {"env_id": env, "expert": plan.expert, "seed": 0, "start": start, "count": count}
-                path = recording.part_path(parts, start)
-                pieces.append(Job(f"record {plan.expert} on {env}", recording.record_part, arguments, path))
-        needs = tuple(piece.output for piece in pieces)
-        jobs += [*pieces, Job(f"collect demonstrations of {env}", collect, recorded, output, needs)]
+        for expert in plan.experts(env):
+            folder = demonstrations_folder(plan, env, out, expert)
+            output, parts = folder / demonstrations.DATA, folder / PARTS
+            recorded = {"env": env, "expert": expert, "episodes": plan.demos}
+            count, pieces = recording.chunk_size(plan.demos), []
+            if not output.exists():  # else they are not needed, and gone
+                for start in range(0, plan.demos, count):
+                    arguments = {"env_id": env, "expert": expert, "seed": 0, "start": start, "count": count}
+                    path = recording.part_path(parts, start)
+                    pieces.append(Job(f"record {expert} on {env}", recording.record_part, arguments, path))
+            needs = tuple(piece.output for piece in pieces)
+            by = "" if expert == plan.expert else f" by {expert}"
+            jobs += [
+                *pieces,
+                Job(f"collect demonstrations of {env}{by}", collect, recorded, output, needs),
+            ]
     return jobs
 
 
 def training_jobs(plan: Plan, out: Path, device: str, every: float) -> list[Job]:
-    """One job for each agent, environment and training seed; ``every`` so many seconds they store their state."""
-    jobs = []
+    """One job for each training that rows need; ``every`` so many seconds they store their state."""
+    jobs: dict[Path, Job] = {}
     for env in plan.envs:
-        for agent, seed in plan.rows(env):
-            if agent not in AGENTS or plan.pretrained:
+        for row, seed in plan.rows(env):
+            agent = plan.agent_of(row)
+            if not agent or plan.pretrained:
                 continue
-            folder = demonstrations_folder(plan, env, out)
             clones = imitates(agent)
-            arguments: dict[str, Any] = {
-                "env": env,
-                "agent": agent,
-                "seed": seed,
-                "config": plan.config(agent, env),
-            }
+            folder = demonstrations_folder(plan, env, out, plan.expert_of(row))
+            # Without what only matters when it acts: rows that share a training store and resume one and the same.
+            config = training_settings(plan, env, row)
+            arguments: dict[str, Any] = {"env": env, "agent": agent, "seed": seed, "config": config}
             arguments |= {"data": folder if clones else None, "device": device, "every": every}
-            output = checkpoint_path(plan, env, agent, seed, out)
-            name = f"train {agent} on {env}" + (f", seed {seed}" if plan.seeds > 1 else "")
+            output = checkpoint_path(plan, env, row, seed, out)
+            name = f"train {split_row(row)[0]} on {env}" + (f", seed {seed}" if plan.seeds > 1 else "")
             needs = (folder / demonstrations.DATA,) if clones else ()
-            jobs.append(Job(name, train, arguments, output, needs, weight=10.0 if clones else 100.0))
-    return jobs
+            jobs.setdefault(output, Job(name, train, arguments, output, needs, 10.0 if clones else 100.0))
+    return list(jobs.values())
 
 
 def tidy(out: Path) -> None:
@@ -128,51 +156,67 @@ def tidy(out: Path) -> None:
 
 
 def evaluation_jobs(plan: Plan, out: Path) -> list[Job]:
-    """One job for each row, noise level and portion of the scenarios."""
+    """One job for each row, noise model and level, and portion of the scenarios."""
     jobs = []
     for env in plan.envs:
         for row, seed in plan.rows(env):
-            trained = checkpoint_path(plan, env, row, seed, out) if row in AGENTS else None
-            for level in plan.noise_levels:
-                for part in plan.chunks(env):
-                    arguments: dict[str, Any] = {"env": env, "row": row, "seed": seed, "checkpoint": trained}
-                    arguments |= {"noise_model": plan.noise_model, "noise_level": level, "scenarios": part}
-                    mark = digest(
-                        env,
-                        row,
-                        seed,
-                        _source(plan, trained),
-                        plan.noise_model,
-                        level,
-                        part.start,
-                        part.count,
-                    )
-                    output = (
-                        out
-                        / "parts"
-                        / env
-                        / f"{row}-seed{seed}-{plan.noise_model}{level:g}-{part.start}-{mark}.parquet"
-                    )
-                    name = f"evaluate {row} on {env} at noise {level:g}"
-                    jobs.append(Job(name, evaluate, arguments, output, (trained,) if trained else ()))
+            actor = _actor(plan, env, row, seed, out)
+            for part in plan.chunks(env):
+                first, *others = (_evaluation(plan, out, actor, seed, *c, part) for c in plan.conditions())
+                if split_row(row)[1] == TRUE:  # the same episodes under every condition: run once
+                    others = [_repetition(job, first) for job in others]
+                jobs += [first, *others]
     return jobs
+
+
+def _evaluation(
+    plan: Plan, out: Path, actor: _Actor, seed: int, model: str, level: float, part: Scenarios
+) -> Job:
+    source, who = actor
+    env, row = who["env"], who["row"]
+    arguments = {**who, "seed": seed, "noise_model": model, "noise_level": level, "scenarios": part}
+    mark = digest(env, row, seed, *source, model, level, part.start, part.count)
+    output = out / "parts" / env / f"{row}-seed{seed}-{model}{level:g}-{part.start}-{mark}.parquet"
+    under = f" ({model})" if len(set(plan.noise_models)) > 1 else ""
+    name = f"evaluate {row} on {env} at noise {level:g}{under}"
+    return Job(name, evaluate, arguments, output, _needed(arguments))
+
+
+def _repetition(job: Job, first: Job) -> Job:
+    """``job``, whose episodes are those of ``first`` under another condition."""
+    under = {name: job.arguments[name] for name in ("noise_model", "noise_level")}
+    arguments = {"source": first.output, **under}
+    return replace(job, run=repeat, arguments=arguments, needs=(first.output,), weight=0.1)
+
+
+def _actor(plan: Plan, env: str, row: str, seed: int, out: Path) -> _Actor:
+    """What names the policy of a row in a digest, and the arguments of a job that needs it."""
+    trained = checkpoint_path(plan, env, row, seed, out) if plan.agent_of(row) else None
+    settings = how_it_acts(plan, env, row)
+    source = [_source(plan, trained), *([settings] if settings else [])]
+    return source, {"env": env, "row": row, "checkpoint": trained, "settings": settings}
+
+
+def _needed(arguments: dict[str, Any]) -> tuple[Path, ...]:
+    return (arguments["checkpoint"],) if arguments["checkpoint"] else ()
 
 
 def video_jobs(plan: Plan, out: Path) -> list[Job]:
     """One clip for each row of the tables, of its first training seed, at the headline noise level."""
-    level = min(plan.noise_levels, key=lambda x: (abs(x - 1), x))
+    headline, model = min(plan.noise_levels, key=lambda x: (abs(x - 1), x)), plan.noise_models[0]
     jobs = []
     for env in plan.envs:
         for row, seed in plan.rows(env):
             if seed:
                 continue
-            trained = checkpoint_path(plan, env, row, 0, out) if row in AGENTS else None
+            level = 0.0 if split_row(row)[1] == TRUE else headline
+            source, arguments = _actor(plan, env, row, 0, out)
             seeds = [int(s) for s in Scenarios(0, min(plan.clips, plan.episodes)).seeds()]
-            arguments: dict[str, Any] = {"env": env, "row": row, "checkpoint": trained, "seeds": seeds}
-            arguments |= {"noise_model": plan.noise_model, "noise_level": level}
-            mark = digest(env, row, _source(plan, trained), plan.noise_model, level, seeds)
+            arguments |= {"seeds": seeds, "noise_model": model, "noise_level": level}
+            arguments["label"] = agent_label(row)
+            mark = digest(env, row, *source, model, level, seeds)
             output = out / "videos" / f"{env}-{row}-{mark}.mp4"
-            needs = (trained,) if trained else ()
+            needs = _needed(arguments)
             jobs.append(Job(f"draw {row} on {env}", record, arguments, output, needs, weight=2.0))
     return jobs
 
@@ -188,12 +232,12 @@ def _source(plan: Plan, trained: Path | None) -> str:
 def check_settings(plan: Plan) -> None:
     """Raise ``ValueError`` if a setting of a trained agent is unknown or out of range, or a shipped one is damaged."""
     for env in plan.envs:
-        for agent in plan.agents:
-            if agent in AGENTS:
+        for row, seed in plan.rows(env):
+            if seed == 0 and plan.agent_of(row):
                 try:
-                    complete_settings(plan, env, agent)
+                    complete_settings(plan, env, row)
                 except (TypeError, ValueError, checkpoint.CheckpointError) as error:
-                    raise ValueError(f"settings of {agent}: {error}") from None
+                    raise ValueError(f"settings of {split_row(row)[0]}: {error}") from None
 
 
 def collect(output: Path, progress: Progress, env: str, expert: str, episodes: int) -> None:
@@ -238,9 +282,10 @@ def evaluate(
     noise_model: str,
     noise_level: float,
     scenarios: Scenarios,
+    settings: dict[str, Any],
 ) -> None:
     """Run one policy through a portion of the scenarios; writes a row per episode."""
-    policy = make_policy(env, row, checkpoint)
+    policy = make_policy(env, row, checkpoint, settings, noise_level)
     seeds, done = scenarios.seeds(), 0
 
     def tell(count: int) -> None:
@@ -253,7 +298,7 @@ def evaluate(
         env,
         seeds,
         noise=noise_model,
-        noise_level=noise_level,
+        noise_level=0.0 if split_row(row)[1] == TRUE else noise_level,
         deterministic=getattr(policy, "evaluate_deterministic", True),
         finished=tell,
     )
@@ -277,3 +322,10 @@ def evaluate(
         }
     )
     results.write_rows(output, table)
+
+
+def repeat(output: Path, progress: Progress, source: Path, noise_model: str, noise_level: float) -> None:
+    """Write the rows of ``source``, episodes on true readings, once more: for the condition that others meet."""
+    columns = results.read_rows(source).to_pydict()
+    columns |= {"noise_model": noise_model, "noise_level": float(noise_level)}
+    results.write_rows(output, results.from_columns(columns))

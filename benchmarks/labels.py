@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
+
+from rise_agents.filters import FILTERS, filter_class
 
 if TYPE_CHECKING:
     from benchmarks.tables import SummaryRow
 
 REFERENCES = ("expert", "random")  # rows to compare with, not agents under test
+TRUE = "true"  # ``ROW+true``: the row on true readings, at whatever level the others meet noise
 _AGENTS = {"rise": "RISE", "pcbc": "PC-BC", "cppo": "C-PPO", "expert": "Expert", "random": "Random"}
 _ENVS = {  # others are read off their id
     "RISE-SafePanda-v0": "Franka Panda",
@@ -25,17 +28,35 @@ _NOISE = {
 }
 
 
+def split_row(row: str) -> tuple[str, str]:
+    """Who acts in a row of the tables, and what stands before it: ``pcbc+kalman`` is ("pcbc", "kalman")."""
+    base, _, filtered = row.partition("+")
+    return base, filtered
+
+
 def is_reference(row: str) -> bool:
     """Whether a row of the tables is one to compare with: chance, or an expert (``expert``, ``expert-cbf``, …)."""
-    return row.split("-")[0] in REFERENCES
+    return split_row(row)[0].split("-")[0] in REFERENCES
+
+
+def name_rows(labels: Mapping[str, str]) -> None:
+    """Say how rows are called from here on in this process: those that no registry knows, such as variants."""
+    _AGENTS.update(labels)
 
 
 def agent_label(name: str) -> str:
-    """The usual spelling of an agent's name: "RISE", "Expert (cbf)"; unknown names stay as they are."""
-    kind, _, which = name.partition("-")
-    if kind == "expert" and which:
-        return f"Expert ({which})"
-    return _AGENTS.get(name, name)
+    """The usual spelling of a row's name: "RISE", "Expert (cbf)", "PC-BC behind a Kalman filter".
+
+    Names that neither a registry nor :func:`name_rows` knows stay as they are.
+    """
+    base, filtered = split_row(name)
+    kind, _, which = base.partition("-")
+    label = f"Expert ({which})" if kind == "expert" and which else _AGENTS.get(base, base)
+    if filtered == TRUE:
+        return f"{label} on true readings"
+    if filtered in FILTERS:
+        return f"{label} {filter_class(filtered).label}"
+    return f"{label}+{filtered}" if filtered else label
 
 
 def env_label(env: str) -> str:

@@ -23,8 +23,9 @@ from benchmarks.jobs import (
     training_jobs,
     video_jobs,
 )
+from benchmarks.labels import name_rows, split_row
 from benchmarks.protocol import Plan, imitates
-from rise_agents import AGENTS, checkpoint, demonstrations, pretrained
+from rise_agents import checkpoint, demonstrations, pretrained
 from rise_agents.files import sweep
 
 
@@ -56,6 +57,7 @@ def execute(plan: Plan, out: Path, how: How) -> list[Failure]:
     for folder in [out, *(path for path in out.rglob("*") if path.is_dir())]:
         sweep(folder)
     tidy(out)
+    name_rows({name: variant.label for name, variant in plan.variants.items() if variant.label})
     with Display() as display:
         evaluations = evaluation_jobs(plan, out)
         jobs = [*recording_jobs(plan, out), *training_jobs(plan, out, how.device, how.every), *evaluations]
@@ -89,21 +91,22 @@ def _write_failures(path: Path, failures: list[Failure]) -> None:
 
 
 def _trained(plan: Plan, out: Path) -> dict[str, dict[str, Any]]:
-    """How each agent was trained, in words and numbers, per agent and environment."""
+    """How the agent of each row was trained and acts, in words and numbers, per row and environment."""
     facts: dict[str, dict[str, Any]] = {}
     for env in plan.envs:
-        for agent in [name for name in plan.agents if name in AGENTS]:
-            path = checkpoint_path(plan, env, agent, 0, out).with_suffix(".json")
+        for row in _trained_rows(plan, env):
+            path = checkpoint_path(plan, env, row, 0, out).with_suffix(".json")
             if plan.pretrained:
                 entry = {"learned from": "before: the weights come with the package"}
-                facts.setdefault(agent, {})[env] = {**entry, **complete_settings(plan, env, agent)}
+                facts.setdefault(row, {})[env] = {**entry, **complete_settings(plan, env, row)}
             elif path.exists():
                 seconds = json.loads(path.read_text())["seconds"]
-                settings = complete_settings(plan, env, agent)
+                settings = complete_settings(plan, env, row)
+                by = "expert" if plan.expert_of(row) == plan.expert else plan.expert_of(row)
                 tried = f"trial in {settings.get('train_env') or 'the environment'}"
-                source = f"{plan.demos:,} expert episodes" if imitates(agent) else tried
+                source = f"{plan.demos:,} {by} episodes" if imitates(plan.agent_of(row)) else tried
                 entry = {"learned from": source, "training time": f"{seconds:.0f} s"}
-                facts.setdefault(agent, {})[env] = {**entry, **settings}
+                facts.setdefault(row, {})[env] = {**entry, **settings}
     return facts
 
 
@@ -114,23 +117,29 @@ def _told(trained: Path, plan: Plan, out: Path) -> str:
     return str(trained.relative_to(out))
 
 
+def _trained_rows(plan: Plan, env: str) -> list[str]:
+    """The rows of trained agents, each once; what stands before one (a filter) makes it no other agent."""
+    bases = dict.fromkeys(split_row(row)[0] for row, _ in plan.rows(env))
+    return [base for base in bases if plan.agent_of(base)]
+
+
 def _write_run(plan: Plan, out: Path, how: How, failures: list[Failure]) -> None:
     """``run.json``: all that is needed to repeat the run."""
     cards = {}
     for env in plan.envs:
-        folder = demonstrations_folder(plan, env, out)
-        if not plan.pretrained and all(
-            (folder / name).exists() for name in (demonstrations.DATA, demonstrations.CARD)
-        ):
-            cards[env] = json.loads((folder / demonstrations.CARD).read_text())
+        recorded = () if plan.pretrained else dict.fromkeys((plan.expert, *plan.experts(env)))
+        for expert in recorded:
+            folder = demonstrations_folder(plan, env, out, expert)
+            if all((folder / name).exists() for name in (demonstrations.DATA, demonstrations.CARD)):
+                card = json.loads((folder / demonstrations.CARD).read_text())
+                cards[env if expert == plan.expert else f"{env} by {expert}"] = card
     run = {
         "command": shlex.join(how.command),
         "plan": asdict(plan),
         "settings": {
-            f"{agent}@{env}": complete_settings(plan, env, agent)
+            f"{row}@{env}": complete_settings(plan, env, row)
             for env in plan.envs
-            for agent in plan.agents
-            if agent in AGENTS
+            for row in _trained_rows(plan, env)
         },
         "device": how.device,
         "failed": [
@@ -142,7 +151,7 @@ def _write_run(plan: Plan, out: Path, how: How, failures: list[Failure]) -> None
             env: {
                 f"{row}-seed{seed}": _told(checkpoint_path(plan, env, row, seed, out), plan, out)
                 for row, seed in plan.rows(env)
-                if row in AGENTS
+                if plan.agent_of(row)
             }
             for env in plan.envs
         },

@@ -164,10 +164,14 @@ def _names(rows: Sequence[SummaryRow], column: str) -> list[str]:
 
 
 def _of_model(summary: Sequence[SummaryRow], noise_model: str | None) -> list[SummaryRow]:
+    """The rows of one model; at level 0, which is the same for all, those of another where it has none itself."""
     models = sorted({row.noise_model for row in summary})
     if noise_model is None and len(models) > 1:
         raise ValueError(f"the summary holds the noise models {', '.join(models)}: choose one for a figure")
-    return [row for row in summary if noise_model in (None, row.noise_model)]
+    own = [row for row in summary if noise_model in (None, row.noise_model)]
+    clean = {(row.env, row.agent): row for row in summary if row.noise_level == 0}
+    missing = {(row.env, row.agent) for row in own} - {(r.env, r.agent) for r in own if r.noise_level == 0}
+    return own + [row for key, row in clean.items() if key in missing]
 
 
 def _panels(

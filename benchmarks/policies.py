@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.labels import split_row
 from rise_agents import load_agent
 from rise_agents.agent import State, draw_state, fresh_state
 from rise_agents.cloning import ActionUnits
 from rise_agents.experts import make_expert
+from rise_agents.filters import FILTERS, make_filter
 from rise_agents.readings import as_batch
 from rise_envs import streams
 
@@ -41,10 +43,27 @@ class Random:
         return (action[0] if single else action), (keys, counter + np.uint64(1))
 
 
-def make_policy(env_id: str, row: str, checkpoint: Path | None) -> Any:
-    """The policy of a row of the tables: a trained agent (from its checkpoint), an expert, or chance."""
+def make_policy(
+    env_id: str,
+    row: str,
+    checkpoint: Path | None,
+    settings: dict[str, Any] | None = None,
+    noise_level: float = 0.0,
+) -> Any:
+    """The policy of a row of the tables: a trained agent, an expert, or chance; behind its filter, if it has one.
+
+    Args:
+        env_id: a registered environment.
+        row: its name.
+        checkpoint: of a trained agent.
+        settings: how that agent acts, laid over what is stored.
+        noise_level: of the readings, which a filter knows.
+    """
+    base, filtered = split_row(row)
     if checkpoint is not None:
-        return load_agent(checkpoint, env_id)
-    if row == "random":
-        return Random(env_id)
-    return make_expert(row.removeprefix("expert-"), env_id)
+        policy: Any = load_agent(checkpoint, env_id, "cpu", settings)
+    elif base == "random":
+        policy = Random(env_id)
+    else:
+        policy = make_expert(base.removeprefix("expert-"), env_id)
+    return make_filter(filtered, policy, env_id, noise_level) if filtered in FILTERS else policy

@@ -23,6 +23,7 @@ from benchmarks.labels import (
     count,
     env_label,
     interval,
+    name_rows,
     noise_label,
     p_value,
     percent,
@@ -256,7 +257,8 @@ def publish(rows: pa.Table, run: Mapping[str, Any], out: Path) -> list[SummaryRo
 
     Args:
         rows: episodes, at least one.
-        run: what is known of the run, as in :func:`summary_markdown`; and ``rows``, the order of the agents.
+        run: what is known of the run, as in :func:`summary_markdown`; ``rows``, the order of the agents; and
+            ``labels``, how those are called that no registry knows.
         out: folder that exists.
 
     Returns:
@@ -266,6 +268,7 @@ def publish(rows: pa.Table, run: Mapping[str, Any], out: Path) -> list[SummaryRo
         ValueError: no episodes, or episodes that cannot be compared (:func:`benchmarks.tables.analyse`).
         OSError: a file cannot be written.
     """
+    name_rows(run.get("labels", {}))
     summary, comparisons = analyse(rows, run.get("rows", ()))
     if not summary:
         raise ValueError("there are no episodes to report")
@@ -297,12 +300,14 @@ def read_run(folder: Path) -> dict[str, Any]:
         return {}
     try:
         record = json.loads(path.read_bytes())
+        variants = dict(record["plan"].get("variants", {})).items()
         return {
             "command": str(record["command"]),
             "rows": [str(name) for name in record.get("rows", record["plan"]["agents"])],
             "training": dict(record.get("training", {})),
+            "labels": {name: str(each["label"]) for name, each in variants if each["label"]},
         }
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(f"{path} is not the record of a run ({type(error).__name__}: {error})") from None
 
 

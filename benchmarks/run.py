@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.protocol import PRESETS, Plan, make_plan
+from benchmarks.protocol import PRESETS, Plan, make_plan, with_filters
 from rise_agents.cli import Parser, prepare_folder
 
 # Those of torch that can train. A name that is none of them is refused without importing torch.
@@ -24,7 +24,8 @@ _DEVICES = ("cpu", "cuda", "hpu", "mps", "mtia", "xla", "xpu")
 _EXAMPLES = """\
 examples:
   python -m benchmarks.run --agents rise pcbc cppo                    both tasks, 1,000 scenarios, about 8 minutes
-  python -m benchmarks.run --agents rise pcbc --envs RISE-GroundVehicle-v0 --noise-model episode
+  python -m benchmarks.run --agents rise pcbc --envs RISE-GroundVehicle-v0 --noise-model step episode
+  python -m benchmarks.run --agents rise rise-mean pcbc pcbc-noisy --filter kalman
   python -m benchmarks.run --agents expert random --noise-levels 0    what the experts reach on true readings
   python -m benchmarks.run --agents rise --set rise.beta=0.1 --out runs/beta-0.1
   python -m benchmarks.run --agents rise pcbc cppo --preset smoke     everything once, in a minute
@@ -46,7 +47,8 @@ def parser() -> Parser:
         nargs="+",
         default=["rise", "pcbc", "cppo"],
         metavar="NAME",
-        help="agents to compare; 'expert' and 'random' add reference rows (default: rise pcbc cppo)",
+        help="agents and variants to compare; 'expert' and 'random' add reference rows, NAME+kalman is NAME behind"
+        " a filter, expert+true the experts on true readings (default: rise pcbc cppo)",
     )
     p.add_argument(
         "--envs", nargs="+", metavar="ID", help="environments (default: all whose results are reported)"
@@ -62,6 +64,21 @@ def parser() -> Parser:
         action="store_true",
         help="train nobody: evaluate the weights that come with the package",
     )
+    p.add_argument(
+        "--config",
+        nargs="+",
+        type=Path,
+        default=[],
+        metavar="FILE",
+        help="TOML files with settings and variants of agents (see benchmarks/configs/variants.toml)",
+    )
+    p.add_argument(
+        "--filter",
+        nargs="+",
+        default=[],
+        metavar="NAME",
+        help="for every row a second one behind this filter, for instance kalman",
+    )
     p.add_argument("--seeds", type=int, metavar="N", help="training seeds per agent")
     p.add_argument(
         "--episodes", type=int, metavar="N", help="test scenarios per condition (preset quick: 1,000)"
@@ -75,9 +92,10 @@ def parser() -> Parser:
     )
     p.add_argument(
         "--noise-model",
-        default="step",
+        nargs="+",
+        default=["step"],
         metavar="MODEL",
-        help="step, episode, drift, dropout, delay, quantise, or a sum as in step+episode (default: step)",
+        help="step, episode, drift, dropout, delay, quantise, or sums as in step+episode (default: step)",
     )
     p.add_argument("--demos", type=int, metavar="N", help="expert episodes to learn from, per environment")
     p.add_argument("--expert", default="mixture", metavar="NAME", help="who demonstrates (default: mixture)")
@@ -87,7 +105,7 @@ def parser() -> Parser:
         default=[],
         metavar="AGENT.FIELD=VALUE",
         dest="settings",
-        help="settings of an agent, for instance rise.beta=0.1 or cppo@RISE-SafePanda-v0.total_steps=100000",
+        help="settings of an agent or variant, as in rise.beta=0.1 or cppo@RISE-SafePanda-v0.total_steps=100000",
     )
     p.add_argument(
         "--workers",
@@ -136,17 +154,18 @@ def plan_of(arguments: argparse.Namespace) -> Plan:
         raise ValueError(f"--workers must be at least 1, got {arguments.workers}")
     if not arguments.checkpoint_every >= 0:
         raise ValueError(f"--checkpoint-every must not be negative, got {arguments.checkpoint_every}")
-    if arguments.pretrained and (arguments.settings or arguments.seeds or arguments.demos):
-        raise ValueError("--pretrained trains nobody: leave out --set, --seeds and --demos")
+    if arguments.pretrained and (arguments.seeds or arguments.demos):
+        raise ValueError("--pretrained trains nobody: leave out --seeds and --demos")
     reported = [env for env in ENVS if env not in STAND_INS]
     plan = make_plan(
         arguments.preset,
         parse_settings(arguments.settings),
-        agents=tuple(dict.fromkeys(arguments.agents)),
+        arguments.config,
+        agents=with_filters(arguments.agents, arguments.filter),
         envs=tuple(dict.fromkeys(arguments.envs or reported)),
         demos=arguments.demos,
         episodes=arguments.episodes,
-        noise_model=arguments.noise_model,
+        noise_models=tuple(dict.fromkeys(arguments.noise_model)),
         noise_levels=None if arguments.noise_levels is None else tuple(sorted(set(arguments.noise_levels))),
         seeds=arguments.seeds,
         expert=arguments.expert,

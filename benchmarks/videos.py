@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from benchmarks.labels import agent_label, env_label
+from benchmarks.labels import env_label
 from benchmarks.policies import make_policy
 from rise_agents.agent import Progress, initial_state
 from rise_agents.files import replace_file, replacing
@@ -101,14 +101,16 @@ def record(
     noise_model: str,
     noise_level: float,
     seeds: list[int],
+    settings: dict[str, Any],
+    label: str,
 ) -> None:
     """Write an MP4 of the episodes that ``seeds`` name, and a PNG strip of key frames of the first."""
-    policy = make_policy(env, row, checkpoint)
+    policy = make_policy(env, row, checkpoint, settings, noise_level)
     clips = []
     for n, seed in enumerate(seeds):
         clips.append(film(policy, env, seed, noise_model, noise_level))
         progress((n + 0.5) / len(seeds), {})
-    title = f"{agent_label(row)} · {env_label(env)} · noise level {noise_level:g}"
+    title = f"{label} · {env_label(env)} · noise level {noise_level:g}"
     frames: list[Frame] = []
     for n, clip in enumerate(clips):
         for i, frame in enumerate(clip.frames):

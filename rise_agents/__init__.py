@@ -11,7 +11,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from rise_agents.agent import Agent, nearest
+from rise_agents.agent import Agent, acting_settings, config_from_dict, nearest
 from rise_envs.streams import checked_seed
 
 __version__ = "0.1.0"
@@ -54,17 +54,24 @@ def make_agent(
     return agent_class(name)(env_id, {} if config is None else config, _seed(seed), device)
 
 
-def load_agent(path_or_name: str | os.PathLike[str], env: str | None = None, device: str = "cpu") -> Agent:
+def load_agent(
+    path_or_name: str | os.PathLike[str],
+    env: str | None = None,
+    device: str = "cpu",
+    settings: dict[str, Any] | None = None,
+) -> Agent:
     """A trained agent: from a checkpoint, or by name one of those that come with the package.
 
     Args:
         path_or_name: a file; or, if there is no such file, the name of an agent (:mod:`rise_agents.pretrained`).
         env: the environment that it must be of. A name needs it.
         device: a torch device.
+        settings: how it acts, laid over what is stored: of the settings that its class names in ``ACTING``.
 
     Raises:
         rise_agents.checkpoint.CheckpointError: unreadable, damaged, or of another environment.
-        ValueError: a name without weights for ``env`` in the package, or without ``env``.
+        ValueError: a name without weights for ``env`` in the package, or without ``env``; a setting that does not
+            exist, that is out of range, or that training depended on.
     """
     from rise_agents import checkpoint
 
@@ -77,9 +84,12 @@ def load_agent(path_or_name: str | os.PathLike[str], env: str | None = None, dev
         raise checkpoint.CheckpointError(
             path, f"was trained on {own!r}, not {env!r}", "train on that environment"
         )
+    if settings:
+        _check_acting(name, settings)
     try:
         _seed(description["seed"])
-        return agent_class(name).from_checkpoint(arrays, description, device)
+        config = {**description["config"], **(settings or {})}
+        return agent_class(name).from_checkpoint(arrays, {**description, "config": config}, device)
     except Exception as error:  # a right digest says who wrote a file, not that it makes sense
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise checkpoint.CheckpointError(path, f"is no whole agent ({reason})", "train it again") from None
@@ -95,8 +105,20 @@ def _file_of(path_or_name: str | os.PathLike[str], env: str | None) -> str | os.
         or Path(path_or_name).exists()
     ):
         return path_or_name
-    meant = env is not None or path_or_name in AGENTS or path_or_name in dict(pretrained.available())
+    meant = path_or_name in AGENTS or path_or_name in dict(pretrained.available())
+    meant = meant or (env is not None and "." not in path_or_name)  # with a dot it looks like a file
     return pretrained.find(path_or_name, env) if meant else path_or_name
+
+
+def _check_acting(name: str, settings: dict[str, Any]) -> None:
+    """Raise ``ValueError`` unless an agent of this name can be told to act so after its training."""
+    kind = agent_class(name)
+    config_from_dict(kind.Config, settings)
+    known = acting_settings(kind)
+    for setting in settings:
+        if setting not in known:
+            told = f"known: {', '.join(sorted(known))}" if known else "it has none"
+            raise ValueError(f"{setting!r} is no setting that a trained {name} acts by; {told}")
 
 
 def _seed(seed: Any) -> int:

@@ -51,6 +51,9 @@ class Agent(Policy, Protocol):
         evaluate_deterministic: how the agent is meant to act when it is judged.
         Config: the frozen dataclass of its settings.
         PRESETS: per environment id, settings that serve better there than the defaults.
+
+    Settings that change how it acts and nothing that it learns are named by a class attribute
+    ``ACTING: frozenset[str]``, if it has any: what is trained once then acts with any of them.
     """
 
     Config: type
@@ -117,6 +120,11 @@ def make_config(kind: Any, env_id: str, values: dict[str, Any]) -> Any:
 def config_to_dict(config: Any) -> dict[str, Any]:
     """The inverse of :func:`config_from_dict`, fit for JSON."""
     return {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(config).items()}
+
+
+def acting_settings(kind: Any) -> frozenset[str]:
+    """The settings of an agent class that matter only when it acts; most have none."""
+    return getattr(kind, "ACTING", frozenset())
 
 
 def require(condition: bool, what: str, value: Any) -> None:

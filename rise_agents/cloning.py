@@ -53,7 +53,9 @@ class CloningConfig:
         updates: gradient steps of the policy.
         batch_size: transitions per step.
         learning_rate: of Adam, decayed to zero by a cosine.
-        transitions: use only the first whole episodes with at most so many transitions (0: all).
+        transitions: learn from whole episodes with at most so many transitions, another, disjoint part of the
+            demonstrations for each training seed: seed k takes the k-th such block, and where the set has fewer
+            blocks, it begins again with the first. 0: every seed learns from all of them.
     """
 
     frame: str = "body"
@@ -195,7 +197,7 @@ def begin(agent: Any, source: Any, progress: Progress, resume: Resume | StrPath 
     from rise_agents.stages import Stages
 
     c = agent.config
-    demonstrations = check_source(source, agent.env_id, agent.name, c.transitions)
+    demonstrations = check_source(source, agent)
     kept = Resume.of(resume)
     stages = Stages(kept, *kept.open(agent, demonstrations.digest() if kept.path else ""))
     generator = seeded(agent.seed, agent.device)
@@ -236,17 +238,18 @@ def seeded(seed: int, device: str) -> torch.Generator:
     return torch.Generator(device=device).manual_seed(seed)
 
 
-def check_source(source: Any, env_id: str, name: str, transitions: int) -> Demonstrations:
-    """``source`` as demonstrations of the agent's own environment, cut to at most ``transitions`` (0: all).
+def check_source(source: Any, agent: Any) -> Demonstrations:
+    """``source`` as demonstrations of the agent's own environment, cut to what its config and its seed say.
 
     Raises:
         ValueError: something else, or demonstrations of another environment.
     """
     if not isinstance(source, Demonstrations):
-        raise ValueError(f"{name} learns from Demonstrations, got {type(source).__name__}")
-    if source.env_id != env_id:
-        raise ValueError(f"{name} for {env_id!r} was given demonstrations of {source.env_id!r}")
-    return source.within(transitions) if transitions else source
+        raise ValueError(f"{agent.name} learns from Demonstrations, got {type(source).__name__}")
+    if source.env_id != agent.env_id:
+        raise ValueError(f"{agent.name} for {agent.env_id!r} was given demonstrations of {source.env_id!r}")
+    transitions = agent.config.transitions
+    return source.within(transitions, block=agent.seed) if transitions else source
 
 
 def save(path: str | os.PathLike[str], agent: Any, arrays: dict[str, NDArray]) -> None:

@@ -47,6 +47,7 @@ if TYPE_CHECKING:
 
     from rise_agents.networks import VAE
 
+POSTERIORS = ("sample", "mean")
 _ONE = np.uint64(1)
 _LOG_SIGMA_RANGE = tuple(np.float32(bound) for bound in LOG_SIGMA_RANGE)
 
@@ -63,6 +64,7 @@ class Config(CloningConfig):
         vae_updates: gradient steps of stage 1.
         vae_batch_size: readings per step of stage 1.
         average: actions averaged over so many samples at inference (1: the paper's single draw).
+        posterior: ``sample``: act on draws of z, as the paper; ``mean``: act on z = μ, and draw nothing.
     """
 
     latent: int = 5
@@ -72,6 +74,7 @@ class Config(CloningConfig):
     vae_updates: int = 10_000
     vae_batch_size: int = 256
     average: int = 1
+    posterior: str = "sample"
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -79,6 +82,7 @@ class Config(CloningConfig):
         require_widths("encoder_hidden", self.encoder_hidden)
         for name in ("latent", "n_samples", "vae_updates", "vae_batch_size", "average"):
             require(getattr(self, name) >= 1, f"{name} must be at least 1", getattr(self, name))
+        require(self.posterior in POSTERIORS, f"posterior must be one of {POSTERIORS}", self.posterior)
 
 
 class Rise:
@@ -103,6 +107,7 @@ class Rise:
             "vae_updates": Choice((5_000, 10_000)),
         }
     }
+    ACTING: ClassVar[frozenset[str]] = frozenset({"average", "posterior"})
     learns_from = "demonstrations"
     evaluate_deterministic = False  # the paper draws z from the posterior at inference
 
@@ -240,14 +245,14 @@ class Rise:
             observation: with the keys of the environment.
             state: what the last call returned.
             episode_start: (B,), rows whose stream of samples starts anew.
-            deterministic: act on the posterior mean instead of a sample.
+            deterministic: act on the posterior mean instead of a sample, as with ``posterior="mean"`` always.
         """
         if not self._arrays:
             raise cloning.untrained(self.name)
         rows, single = readings.checked_batch(self.task, observation)
         robot, reading = self._eyes.inputs(rows)
         mu, sigma = self.encode(reading)
-        if deterministic:
+        if deterministic or self.config.posterior == "mean":
             action = self._act(robot, mu)
         else:
             keys, counter = draw_state(state, episode_start, len(mu), self._rng)

@@ -71,7 +71,20 @@ class VehicleTask(goals.GoalAPI):
         p = DEFAULTS if params is None else as_settings(Params, params)
         n_obstacles = whole("n_obstacles", n_obstacles, 1)
         scale = (1.0,) * (5 * n_obstacles)
-        return Task(2, n_obstacles, scale, p.robot_radius, p.goal_radius, p.dt, p.v_max, _pose, (), 3)
+        return Task(
+            dim=2,
+            n_obstacles=n_obstacles,
+            noise_scale=scale,
+            robot_radius=p.robot_radius,
+            goal_radius=p.goal_radius,
+            dt=p.dt,
+            max_speed=p.v_max,
+            pose=_pose,
+            body_state=(),
+            state_size=3,
+            obstacle_speed=p.obstacle_speed,
+            redraw_interval=p.redraw_interval,
+        )
 
     @property
     def noise_scale(self) -> dict[str, Array]:

@@ -46,6 +46,8 @@ class PandaTask(goals.GoalAPI):
             pose=_pose,
             body_state=tuple(range(13)),
             state_size=13,
+            obstacle_speed=p.max_speed,
+            redraw_interval=p.redraw_interval,
         )
 
     @property

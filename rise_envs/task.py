@@ -37,6 +37,9 @@ class Task:
             are the frame's axes in world coordinates.
         body_state: columns of the state that keep their meaning when the world is seen from the robot.
         state_size: S.
+        obstacle_speed: greatest speed of a ball (m/s): speeds are drawn from U[0, obstacle_speed], directions
+            uniformly.
+        redraw_interval: mean time between two draws of a ball's velocity (s).
     """
 
     dim: int
@@ -49,6 +52,8 @@ class Task:
     pose: Callable[[Array], tuple[Array, Array]]
     body_state: tuple[int, ...]
     state_size: int
+    obstacle_speed: float
+    redraw_interval: float
 
     @cached_property
     def widths(self) -> dict[str, int]:

@@ -11,6 +11,7 @@ import pytest
 from rise_agents import archive
 from rise_agents.demonstrations import CARD, DATA, DatasetError, generate, load, minari_io
 from rise_agents.demonstrations.__main__ import main
+from rise_agents.demonstrations.dataset import check
 
 VEHICLE = "RISE-GroundVehicle-v0"
 
@@ -84,6 +85,32 @@ def test_first_and_subsample(vehicle_demonstrations):
     assert len(some.actions) <= 200 < vehicle_demonstrations.offsets[len(some) + 1]
     assert len(vehicle_demonstrations.within(1)) == 1
     assert len(vehicle_demonstrations.subsample(10)["obstacle"]) <= 10
+
+
+def test_blocks_are_disjoint_parts_that_wrap_round(vehicle_demonstrations):
+    """Against the episodes dealt out one by one: a block takes what fits, what is left at the end is no block."""
+    lengths = np.diff(vehicle_demonstrations.offsets).tolist()
+    blocks, open_block = [], []
+    for episode, length in enumerate(lengths):
+        if open_block and sum(lengths[e] for e in open_block) + length > 500:
+            blocks.append(open_block)
+            open_block = []
+        open_block.append(episode)
+    assert len(blocks) >= 3 and open_block
+    for number in range(2 * len(blocks)):
+        part, wanted = vehicle_demonstrations.within(500, number), blocks[number % len(blocks)]
+        assert part.seeds.tolist() == vehicle_demonstrations.seeds[wanted].tolist()
+        check(part)  # offsets, final observations and card fit
+        start = vehicle_demonstrations.offsets[wanted[0]]
+        np.testing.assert_array_equal(
+            part.actions, vehicle_demonstrations.actions[start:][: len(part.actions)]
+        )
+    # What is smaller than one block is the only block.
+    whole = vehicle_demonstrations.within(len(vehicle_demonstrations.actions) + 1, 7)
+    assert whole.digest() == vehicle_demonstrations.digest()
+    # An episode that has more alone is a block.
+    assert [len(vehicle_demonstrations.within(1, k)) for k in range(40)] == [1] * 40
+    assert len({int(vehicle_demonstrations.within(1, k).seeds[0]) for k in range(41)}) == 40
 
 
 def _forge(folder, change):

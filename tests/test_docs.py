@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.configs import SHIPPED, read
 from benchmarks.protocol import PRESETS, make_plan
 from benchmarks.results import SCHEMA
 from benchmarks.run import parser
@@ -26,6 +27,8 @@ from rise_agents import AGENTS, agent_class, readings
 from rise_agents.agent import make_config
 from rise_agents.cloning import CloningConfig
 from rise_agents.experts import EXPERTS
+from rise_agents.filters import FILTERS
+from rise_agents.pcbc import Config as PCBCConfig
 from rise_agents.rise import Config as RiseConfig
 from rise_agents.seeds import SPLITS
 from rise_envs import ENVS, NOISE_MODELS, STAND_INS, make_noise
@@ -229,14 +232,22 @@ def test_the_table_of_experts_agrees_with_the_registry():
     }
 
 
+def test_the_table_of_filters_agrees_with_the_registry():
+    rows = table("agents.md", "name", "class", "method")
+    assert {name: kind for name, kind, _ in rows} == {
+        name: path.partition(":")[2] for name, path in FILTERS.items()
+    }
+
+
 def test_the_table_of_settings_has_every_field_and_its_default():
     rows = table("agents.md", "setting", "default", "of")
     shared = [field.name for field in fields(CloningConfig)]
-    assert [row[0] for row in rows] == [field.name for field in fields(RiseConfig)]
+    expected = [("rise, pcbc" if f.name in shared else "rise", f.name) for f in fields(RiseConfig)]
+    expected += [("pcbc", field.name) for field in fields(PCBCConfig) if field.name not in shared]
+    assert [(row[2], row[0]) for row in rows] == expected
     for name, default, of, _ in rows:
-        assert default == str(getattr(RiseConfig(), name))
-        assert of == ("rise, pcbc" if name in shared else "rise")
-        assert name not in shared or getattr(CloningConfig(), name) == getattr(RiseConfig(), name)
+        for kind, known in ((RiseConfig, "rise"), (PCBCConfig, "pcbc")):
+            assert known not in of.split(", ") or default == str(getattr(kind(), name))
 
 
 def test_the_table_of_frames_has_the_sizes_of_their_inputs():
@@ -291,7 +302,7 @@ def test_the_table_of_presets_agrees_with_them(preset):
     place = list(PRESETS).index(preset) + 1
     said = {row[0]: row[place] for row in table("benchmark.md", "", *heads)}
     known = PRESETS[preset]
-    plan = make_plan(preset, {}, agents=tuple(AGENTS), envs=tuple(TASKS), noise_model="step")
+    plan = make_plan(preset, {}, agents=tuple(AGENTS), envs=tuple(TASKS), noise_models=("step",))
 
     def setting(agent: str, env: str, field: str) -> int:
         return getattr(make_config(agent_class(agent), env, plan.config(agent, env)), field)
@@ -331,6 +342,25 @@ def test_the_table_of_options_has_every_option_of_the_command(head, command):
             assert default == " ".join(value)
         elif value is not None and not isinstance(value, bool):
             assert default == f"{value:g}" if isinstance(value, float | int) else str(value)
+
+
+def test_the_table_of_variants_agrees_with_the_shipped_file():
+    found = read([SHIPPED])
+    rows = table("benchmark.md", "variant", "agent", "differs in")
+    assert [row[0] for row in rows] == list(found.variants)
+    for name, agent, differs in rows:
+        variant, settings = found.variants[name], found.layers[0][name]
+        words = [f"{key} {value}" for key, value in settings.items()]
+        words += [f"demonstrations by {variant.expert}"] if variant.expert else []
+        assert (agent, differs) == (variant.agent, ", ".join(words))
+
+
+def test_the_config_file_of_the_page_is_one(tmp_path):
+    (text,) = re.findall(r"```toml\n(.*?)```", (DOCS / "benchmark.md").read_text(), re.DOTALL)
+    path = tmp_path / "mine.toml"
+    path.write_text(text)
+    found = read([path])
+    assert list(found.variants) == ["rise-large"] and next(iter(found.layers[0])) == "rise"
 
 
 def test_the_table_of_seeds_agrees_with_the_splits():

@@ -152,6 +152,21 @@ def test_requests_that_make_no_sense_say_why():
         plots.noise_curve([])
 
 
+def test_level_0_that_was_measured_once_is_in_the_curve_of_every_model():
+    """As a run of several noise models measures it: under the first."""
+    first = make_summary(agents=("rise", "pcbc"))
+    second = [row for row in make_summary(noise_model="episode", agents=("rise", "pcbc")) if row.noise_level]
+    alone = make_summary(noise_model="episode", agents=("rise", "pcbc"))
+
+    def drawn(summary, model):
+        axes = plots.noise_curve(summary, model).axes
+        return [sorted(line.get_xydata().tolist() for line in axis.lines) for axis in axes]
+
+    assert drawn(first + second, "episode") == drawn(alone, "episode")
+    assert drawn(first + second, "step") == drawn(first, "step")
+    assert drawn(first + alone, "episode") == drawn(alone, "episode")  # nothing twice where both have it
+
+
 def test_agents_keep_their_colours_whatever_is_shown_beside_them():
     everyone = [plots.colour(MANY, agent) for agent in MANY[:6]]
     assert len(set(everyone)) == 6

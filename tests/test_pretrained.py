@@ -14,13 +14,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import results
-from benchmarks.jobs import evaluation_jobs
+from benchmarks import configs, results
+from benchmarks.jobs import check_settings, evaluation_jobs, how_it_acts
 from benchmarks.protocol import make_plan
 from benchmarks.run import main as run
 from rise_agents import load_agent, make_agent, pretrained
 from rise_agents.checkpoint import CheckpointError
+from rise_agents.filters.kalman import KalmanFilter
 from rise_agents.pretrained.__main__ import main as ship
+from rise_agents.rollout import rollout
 
 VEHICLE, PANDA = "RISE-GroundVehicle-v0", "RISE-SafePanda-v0"
 PACKAGE = pretrained.FOLDER
@@ -79,6 +81,42 @@ def test_shipped_files_are_the_run_s_own_with_a_card(shipped, finished, vehicle_
             agent.predict(batch, deterministic=True)[0],
             load_agent(finished / "agents" / f"{name}-0.rise").predict(batch, deterministic=True)[0],
         )
+
+
+def test_a_row_that_acts_otherwise_is_shipped_as_it_acted(finished, folder, tmp_path, vehicle_demonstrations):
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    paths = {
+        f"{name}-seed0": "agents/rise-0.rise" for name in ("rise", "rise-mean", "rise-beta0.1", "rise+kalman")
+    }
+    stored = load_agent(run / "agents" / "rise-0.rise").config
+    record(
+        run,
+        agents={VEHICLE: paths},
+        settings={f"rise-mean@{VEHICLE}": {"posterior": "mean", "average": stored.average, "updates": 20}},
+        plan={"variants": {"rise-beta0.1": {"agent": "rise", "expert": "mpc"}}},
+        demonstrations={VEHICLE: {"expert": "cbf"}, f"{VEHICLE} by mpc": {"expert": "mpc"}},
+    )
+    assert ship([str(run), "--into", str(folder)]) == 0
+    assert [name for name, _ in pretrained.available()] == ["rise", "rise-beta0.1", "rise-mean"]
+    card = json.loads((folder / "card.json").read_text())
+    source = (run / "agents" / "rise-0.rise").read_bytes()
+    for name in ("rise", "rise-beta0.1"):
+        assert pretrained.find(name, VEHICLE).read_bytes() == source
+    mean, told = pretrained.find("rise-mean", VEHICLE), card[f"rise-mean-{VEHICLE}.rise"]
+    assert (
+        told["sha256"] == hashlib.sha256(mean.read_bytes()).hexdigest() != hashlib.sha256(source).hexdigest()
+    )
+    assert told["config"]["posterior"] == "mean" and told["demonstrations"] == {"expert": "cbf"}
+    assert card[f"rise-beta0.1-{VEHICLE}.rise"]["demonstrations"] == {"expert": "mpc"}
+    batch = vehicle_demonstrations.subsample(8)
+    for name, settings in (("rise", None), ("rise-beta0.1", None), ("rise-mean", {"posterior": "mean"})):
+        expected = load_agent(run / "agents" / "rise-0.rise", settings=settings)
+        agent = load_agent(name, env=VEHICLE)
+        assert agent.config == expected.config
+        np.testing.assert_array_equal(agent.predict(batch)[0], expected.predict(batch)[0])
+    asked = load_agent("rise", VEHICLE, "cpu", {"posterior": "mean", "average": 3}).config
+    assert (asked.posterior, asked.average) == ("mean", 3)
 
 
 def test_shipping_more_keeps_what_is_there(shipped, finished, capsys):
@@ -180,6 +218,8 @@ def test_bad_arguments_of_shipping(arguments, says, finished, folder, capsys):
 
 
 @pytest.mark.parametrize("text", [None, "", "[]", "{}", '{"command": 1, "agents": {}, "demonstrations": {}}',
+                                  '{"command": "", "agents": {}, "demonstrations": {}, "settings": {"x": 1}}',
+                                  '{"command": "", "agents": {}, "demonstrations": {}, "plan": []}',
                                   '{"command": "", "agents": {"x": {"y": 1}}, "demonstrations": {}}'])  # fmt: skip
 def test_a_folder_that_is_no_run_is_refused(text, tmp_path, folder, capsys):
     if text is not None:
@@ -231,11 +271,76 @@ def test_a_run_evaluates_them_and_trains_nobody(shipped, tmp_path):
     assert "come with the package" in (out / "summary.md").read_text()
 
 
+def plan(*agents, settings=None, **chosen):
+    chosen = {"envs": (VEHICLE,), "noise_models": ("step",), "pretrained": True, **chosen}
+    return make_plan("smoke", settings or {}, agents=agents, **chosen)
+
+
+def test_rows_of_all_kinds_are_run_with_shipped_weights(shipped, tmp_path):
+    """A variant of how an agent acts has its weights; behind a filter, on true readings, under every noise model."""
+    out = tmp_path / "out"
+    rows = ["--agents", "rise-mean", "rise-mean+true", "pcbc+kalman", "expert+true", "--no-videos"]
+    noise = ["--noise-model", "step", "episode", "--noise-levels", "0", "1"]
+    assert run([*COMMAND, *rows, *noise, "--out", str(out)]) == 0
+    assert {path.name for path in out.iterdir()}.isdisjoint({"agents", "demonstrations"})
+    table = results.read_rows(out / "episodes.parquet").to_pylist()
+    seeds = sorted({row["env_seed"] for row in table})
+    mean = load_agent(shipped / f"rise-{VEHICLE}.rise", settings={"posterior": "mean"})
+    kalman = KalmanFilter(load_agent("pcbc", VEHICLE), mean.task, 1.0)
+    for name, policy, level in (
+        ("rise-mean", mean, 1.0),
+        ("rise-mean+true", mean, 0.0),
+        ("pcbc+kalman", kalman, 1.0),
+    ):
+        for model in ("step", "episode"):
+            condition = (name, model, 1.0)
+            measured = [
+                row["episode_return"]
+                for row in table
+                if (row["agent"], row["noise_model"], row["noise_level"]) == condition
+            ]
+            episodes, _ = rollout(policy, VEHICLE, seeds, noise=model, noise_level=level, deterministic=False)
+            np.testing.assert_allclose(measured, episodes.episode_return, rtol=1e-6)
+    told = json.loads((out / "run.json").read_text())
+    assert told["settings"][f"rise-mean@{VEHICLE}"]["posterior"] == "mean"
+    digest = hashlib.sha256((shipped / f"rise-{VEHICLE}.rise").read_bytes()).hexdigest()
+    assert digest in told["agents"][VEHICLE]["rise-mean-seed0"]
+    assert "RISE, z = μ" in (out / "summary.md").read_text()
+
+
+def test_a_variant_has_its_own_file_or_that_of_its_agent(shipped, folder):
+    run = plan("rise-mean", "rise-body")
+    assert run.shipped("rise-mean+kalman", VEHICLE) == folder / f"rise-{VEHICLE}.rise"
+    with pytest.raises(
+        ValueError, match=r"settings of rise-z2: rise-.*\.rise was trained with latent = 5, not 2"
+    ):
+        check_settings(plan("rise-z2"))
+    shutil.copy(folder / f"rise-{VEHICLE}.rise", folder / f"rise-mean-{VEHICLE}.rise")
+    assert run.shipped("rise-mean", VEHICLE) == folder / f"rise-mean-{VEHICLE}.rise"
+    check_settings(plan("rise-mean", "rise-body"))  # body is what it was trained with
+
+
+def test_acting_settings_are_laid_over_shipped_weights(shipped, tmp_path):
+    run = plan("rise", "rise-mean", settings={"rise": {"average": 3}, f"rise-mean@{VEHICLE}": {"average": 4}})
+    assert how_it_acts(run, VEHICLE, "rise") == {"average": 3, "posterior": "sample"}
+    assert how_it_acts(run, VEHICLE, "rise-mean") == {"average": 4, "posterior": "mean"}
+    acting, as_shipped = evaluation_jobs(run, tmp_path)[0], evaluation_jobs(plan("rise"), tmp_path)[0]
+    assert acting.arguments["settings"]["average"] == 3 and acting.output != as_shipped.output
+
+
+def test_settings_of_presets_and_of_tuning_are_not_those_of_shipped_weights(shipped, tmp_path, monkeypatch):
+    tuned = tmp_path / "tuned.toml"
+    tuned.write_text("[rise]\nbeta = 0.3\n")
+    monkeypatch.setattr(configs, "TUNED", tuned)
+    run = make_plan("paper", {}, agents=("rise",), envs=(VEHICLE,), noise_models=("step",), pretrained=True)
+    assert run.settings == {} and run.seeds == 1
+    check_settings(run)
+
+
 def test_new_weights_do_not_meet_old_results(shipped, finished, tmp_path):
-    plan = make_plan("smoke", {}, agents=("rise",), envs=(VEHICLE,), noise_model="step", pretrained=True)
-    (before,) = evaluation_jobs(plan, tmp_path)
+    (before,) = evaluation_jobs(plan("rise"), tmp_path)
     assert ship([str(finished), "--seed", "1", "--into", str(shipped)]) == 0
-    (after,) = evaluation_jobs(plan, tmp_path)
+    (after,) = evaluation_jobs(plan("rise"), tmp_path)
     assert before.output != after.output
 
 
@@ -246,7 +351,18 @@ def test_new_weights_do_not_meet_old_results(shipped, finished, tmp_path):
         (["--agents", "rise", "--envs", PANDA], f"no weights of 'rise' for '{PANDA}'"),
         (["--agents", "rise", "--seeds", "2"], "leave out"),
         (["--agents", "rise", "--demos", "2"], "leave out"),
-        (["--agents", "rise", "--set", "rise.updates=2"], "leave out"),
+        (
+            ["--agents", "rise", "--set", "rise.updates=2"],
+            "was trained with updates = 20, not 2: only average, post",
+        ),
+        (["--agents", "pcbc", "--set", "pcbc.updates=2"], "was trained with updates = 20, not 2: none can"),
+        (["--agents", "rise", "--set", "rise.posterior=mode"], "posterior must be one of"),
+        (
+            ["--agents", "rise-m1"],
+            "settings of rise-m1: rise-RISE-GroundVehicle-v0.rise was trained with n_samples",
+        ),
+        (["--agents", "rise-cbf"], f"no weights of 'rise-cbf' for '{VEHICLE}'"),
+        (["--agents", "rise+kalmann"], "did you mean 'kalman'"),
     ],
 )
 def test_what_cannot_be_evaluated_is_told_at_once(arguments, says, shipped, tmp_path, capsys):

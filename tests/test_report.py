@@ -262,6 +262,21 @@ def test_records_of_former_versions_are_read(folder):
     assert "- RISE kept" in (folder / "summary.md").read_text()
 
 
+def test_variants_are_called_as_the_run_called_them(folder):
+    rows = episodes().to_pydict()
+    rows["agent"] = ["told-in-run" if name == "pcbc" else name for name in rows["agent"]]
+    results.write_rows(folder / "episodes.parquet", results.from_columns(rows))
+    variants = {
+        "told-in-run": {"agent": "pcbc", "label": "PC-BC, told"},
+        "untold": {"agent": "pcbc", "label": ""},
+    }
+    plan = {"agents": ["rise", "told-in-run"], "variants": variants}
+    (folder / "run.json").write_text(json.dumps({"command": "make bench", "plan": plan}))
+    assert report.main([str(folder)]) == 0
+    page = (folder / "summary.md").read_text()
+    assert "than PC-BC, told" in page and "told-in-run" not in page
+
+
 def test_every_noise_model_has_its_figures(tmp_path):
     report.publish(episodes(("step", "drift", "step+delay:2")), RECORD, tmp_path)
     marks = ("", "-drift", "-step-delay-2")
@@ -278,6 +293,8 @@ def test_every_noise_model_has_its_figures(tmp_path):
         (b"{", "run.json is not the record"),
         (b"[]", "not the record"),
         (b"{}", "not the record"),
+        (b'{"command": "", "plan": []}', "not the record"),
+        (b'{"command": "", "plan": {"agents": [], "variants": {"x": 1}}}', "not the record"),
         (b"\xff", "not the"),
     ],
 )

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from torch.distributions import Independent, Normal, kl_divergence
 
-from rise_agents import cloning, make_agent
+from rise_agents import cloning, load_agent, make_agent
 from rise_agents.networks import VAE, Encoder, gaussian_kl, mlp, policy_loss, reparameterise
 from rise_agents.rise import Rise
 from rise_agents.stages import to_arrays
@@ -163,6 +165,51 @@ def test_deterministic_acts_on_the_posterior_mean(trained, vehicle_demonstration
     np.testing.assert_array_equal(action, expected)
 
 
+def test_posterior_mean_draws_nothing_even_where_a_sample_is_asked_for(
+    trained, vehicle_demonstrations, tmp_path
+):
+    trained.save(tmp_path / "agent.rise")
+    agent = load_agent(tmp_path / "agent.rise", VEHICLE, "cpu", {"posterior": "mean"})
+    observation = {key: value[:9] for key, value in vehicle_demonstrations.observations.items()}
+    expected, _ = trained.predict(observation, deterministic=True)
+    before = agent.initial_state(np.arange(9, dtype=np.uint64))
+    action, after = agent.predict(observation, before, deterministic=False)
+    np.testing.assert_array_equal(action, expected)
+    assert after is before
+
+
+def test_acting_settings_lie_over_stored_ones(trained, vehicle_demonstrations, tmp_path):
+    """And only these: what training depended on cannot be told afterwards."""
+    trained.save(tmp_path / "agent.rise")
+    path = tmp_path / "agent.rise"
+    agent = load_agent(path, None, "cpu", {"average": 16})
+    assert agent.config == replace(trained.config, average=16)
+    assert load_agent(path, None, "cpu", {}).config == trained.config
+    for settings, reason in (
+        ({"beta": 0.1}, "'beta' is no setting that a trained rise acts by; known: average, posterior"),
+        ({"averag": 2}, "did you mean 'average'"),
+        ({"average": 0}, "average must be at least 1"),
+        ({"posterior": "mode"}, "posterior must be one of"),
+    ):
+        with pytest.raises(ValueError, match=reason):
+            load_agent(path, None, "cpu", settings)
+    pcbc = make_agent("pcbc", VEHICLE, {"updates": 2}).learn(vehicle_demonstrations)
+    pcbc.save(tmp_path / "pcbc.rise")
+    with pytest.raises(ValueError, match="'frame' is no setting that a trained pcbc acts by; it has none"):
+        load_agent(tmp_path / "pcbc.rise", None, "cpu", {"frame": "body"})
+
+
+def test_each_seed_learns_from_its_own_part(vehicle_demonstrations):
+    """Seeds take disjoint blocks of the demonstrations, so that what they differ in includes the data."""
+    agents = [make_agent("rise", VEHICLE, {"transitions": 500}, seed=seed) for seed in range(3)]
+    parts = [cloning.check_source(vehicle_demonstrations, agent) for agent in agents]
+    seeds = [set(part.seeds.tolist()) for part in parts]
+    assert all(len(part.actions) <= 500 for part in parts)
+    assert not (seeds[0] & seeds[1] or seeds[0] & seeds[2] or seeds[1] & seeds[2])
+    everything = cloning.check_source(vehicle_demonstrations, make_agent("rise", VEHICLE, seed=1))
+    assert everything is vehicle_demonstrations
+
+
 def test_average_of_many_samples_has_less_spread(vehicle_demonstrations):
     """The K-sample average: the spread of the action over draws falls as 1/√K where nothing is clipped."""
     one = {key: np.repeat(value[:1], 4_000, 0) for key, value in vehicle_demonstrations.observations.items()}
@@ -194,6 +241,7 @@ def test_decoder_answers_in_units_of_the_reading_noise(trained, vehicle_demonstr
         ("frame", "moon"),
         ("loss", "mae"),
         ("learning_rate", 0.0),
+        ("posterior", "mode"),
         ("hidden", ("a",)),
         ("transitions", "x"),
     ],

@@ -132,6 +132,47 @@ def test_again_in_the_same_folder_redoes_nothing(run, capfd):
     assert "done already" in capfd.readouterr().err
 
 
+MIXED = ["--agents", "pcbc", "quiet", "pcbc-noisy", "expert+true", "--filter", "kalman", "--preset", "smoke"]
+MIXED += ["--envs", VEHICLE, "--expert", "cbf", "--episodes", "4", "--noise-model", "step", "episode"]
+MIXED += ["--noise-levels", "0", "1", "--workers", "1", "--no-videos"]
+
+
+def test_rows_of_all_kinds_under_several_noise_models(tmp_path):
+    config, out = tmp_path / "mine.toml", tmp_path / "out"
+    config.write_text('[variants.quiet]\nagent = "pcbc"\nlabel = "PC-BC, quietly"\nframe = "body"\n')
+    assert main([*MIXED, "--config", str(config), "--out", str(out)]) == 0
+    rows = results.read_rows(out / "episodes.parquet").to_pylist()
+    met = {}
+    for row in rows:
+        met.setdefault(row["agent"], []).append((row["noise_model"], row["noise_level"]))
+    names = ["pcbc", "quiet", "pcbc-noisy"]
+    names += [f"{name}+kalman" for name in names]
+    assert set(met) == {*names, *(f"expert-{each}+true" for each in ("cbf", "mpc", "mixture"))}
+    for conditions in met.values():
+        assert sorted(conditions) == 4 * [("episode", 1.0)] + 4 * [("step", 0.0)] + 4 * [("step", 1.0)]
+
+    def outcome(agent, level):
+        return [row["episode_return"] for row in rows if (row["agent"], row["noise_level"]) == (agent, level)]
+
+    assert outcome("quiet", 1) == outcome("pcbc", 1)  # body is the default: one training, one behaviour
+    assert outcome("pcbc+kalman", 0) == outcome("pcbc", 0) != outcome("pcbc-noisy", 0)
+    assert outcome("pcbc+kalman", 1) != outcome("pcbc", 1)
+    assert len(list((out / "agents" / VEHICLE).glob("*.rise"))) == 2
+    page = (out / "summary.md").read_text()
+    for words in (
+        "PC-BC, quietly behind a Kalman filter",
+        "comparison-episode.png",
+        "noise_curve-episode.png",
+    ):
+        assert words in page
+    assert (out / "noise_curve-episode.png").exists() and (out / "comparison.png").exists()
+    record = json.loads((out / "run.json").read_text())
+    assert record["plan"]["variants"]["quiet"]["label"] == "PC-BC, quietly"
+    assert record["plan"]["noise_models"] == ["step", "episode"]
+    paths = record["agents"][VEHICLE]
+    assert paths["quiet+kalman-seed0"] == paths["pcbc-seed0"] != paths["pcbc-noisy-seed0"]
+
+
 def test_workers_do_not_change_the_tables(run, tmp_path):
     assert main([*SMALL, "--workers", "2", "--no-videos", "--out", str(tmp_path)]) == 0
     for name in ("episodes.parquet", "summary.csv", "comparisons.csv"):
@@ -146,6 +187,13 @@ def test_workers_do_not_change_the_tables(run, tmp_path):
         (["--preset", "quik"], "did you mean 'quick'"),
         (["--expert", "mixtur"], "did you mean 'mixture'"),
         (["--noise-model", "stepp"], "did you mean 'step'"),
+        (["--noise-model", "step", "episod"], "did you mean 'episode'"),
+        (["--agents", "rise-meen"], "did you mean 'rise-mean'"),
+        (["--agents", "pcbc+kalmann"], "did you mean 'kalman'"),
+        (["--filter", "kalmann"], "did you mean 'kalman'"),
+        (["--config", "no.toml"], "cannot read the config file 'no.toml'"),
+        (["--agents", "rise-mean", "--set", "rise-mean.posterior=mode"], "settings of rise-mean: posterior"),
+        (["--set", "rise-meen.beta=1"], "did you mean 'rise-mean'"),
         (["--noise-levels", "-1"], "not negative"),
         (["--noise-levels", "nan"], "finite"),
         (["--noise-levels", "lots"], "invalid float"),
@@ -190,7 +238,7 @@ def test_a_plan_adds_the_user_s_choices_to_the_preset():
         {"rise": {"beta": 0.2}},
         agents=("rise", "expert"),
         envs=(VEHICLE,),
-        noise_model="step",
+        noise_models=("step",),
         episodes=5,
     )
     assert plan.episodes == 5

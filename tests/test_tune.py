@@ -330,7 +330,8 @@ def test_again_it_redoes_nothing_and_fewer_workers_find_the_same(tuned, tmp_path
     assert main([*command, "--workers", "2", "--out", str(folder / "out")]) == 0
     assert {path: path.stat().st_mtime_ns for path in files} == files
     assert "6 done already" in capfd.readouterr().err
-    for path in list(files)[::2]:  # half of it is missing, as after a kill
+    # Half of it is missing, as after a kill. The record of a training is written before its checkpoint.
+    for path in sorted(path for path in files if path.suffix == ".rise" or path.parts[-3] == "trials")[::2]:
         path.unlink()
     assert main([*command, "--workers", "1", "--out", str(folder / "out")]) == 0
     again = (folder / "out" / "tuned.toml").read_text()

@@ -48,7 +48,7 @@ def workers(effort: Effort) -> Iterator[Sides]:
         {},
         agents=("rise",),
         envs=(PANDA,),
-        noise_model="step",
+        noise_models=("step",),
         noise_levels=(1.0,),
         episodes=effort.size(600, 4),
     )

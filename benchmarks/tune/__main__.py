@@ -119,6 +119,7 @@ def search_of(a: argparse.Namespace) -> Search:
     """The search that the arguments ask for; raises ``ValueError`` for what can be known to fail before any work."""
     from benchmarks.protocol import make_plan
     from benchmarks.tune import settings_file
+    from benchmarks.tune.ranking import MODEL
     from benchmarks.tune.search import Search
     from rise_agents.agent import nearest
     from rise_envs import ENVS, STAND_INS
@@ -137,7 +138,7 @@ def search_of(a: argparse.Namespace) -> Search:
         envs=tuple(dict.fromkeys(a.envs or [env for env in ENVS if env not in STAND_INS])),
         demos=a.episodes,
         episodes=a.scenarios,
-        noise_model="step",
+        noise_models=(MODEL,),
         seeds=a.seeds,
         expert=a.expert,
     )

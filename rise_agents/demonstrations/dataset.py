@@ -78,25 +78,47 @@ class Demonstrations:
         step = max(1, -(-len(self.actions) // rows))
         return {key: value[::step] for key, value in self.observations.items()}
 
-    def within(self, transitions: int) -> Demonstrations:
-        """The first whole episodes with at most ``transitions`` transitions, and at least one episode."""
-        return self.first(max(1, int(np.searchsorted(self.offsets, transitions, side="right")) - 1))
+    def within(self, transitions: int, block: int = 0) -> Demonstrations:
+        """One of the disjoint blocks of whole episodes, in order, with at most ``transitions`` transitions each.
+
+        Every block holds as many episodes as fit, and at least one. What is left at the end is too little for a
+        block and unused, unless all episodes fit into the first.
+
+        Args:
+            transitions: at most so many, but for an episode that has more alone.
+            block: number of the block; beyond the last one it begins again with the first.
+        """
+        starts = [0]
+        while starts[-1] < len(self):
+            most = self.offsets[starts[-1]] + transitions
+            fit = int(np.searchsorted(self.offsets, most, side="right")) - 1
+            starts.append(max(fit, starts[-1] + 1))
+            if fit == len(self):  # the rest fits as a whole: it may be less than a block
+                break
+        blocks = max(1, len(starts) - 1 - (fit == len(self)))
+        number = block % blocks
+        return self.between(starts[number], starts[number + 1])
 
     def first(self, episodes: int) -> Demonstrations:
         """The first ``episodes`` episodes."""
-        episodes = min(episodes, len(self))
-        end = self.offsets[episodes]
+        return self.between(0, episodes)
+
+    def between(self, start: int, stop: int) -> Demonstrations:
+        """The episodes from number ``start`` on, up to but not with number ``stop``."""
+        stop = min(stop, len(self))
+        rows, episodes = slice(self.offsets[start], self.offsets[stop]), slice(start, stop)
+        offsets = self.offsets[start : stop + 1] - self.offsets[start]
         return Demonstrations(
             self.env_id,
-            {key: value[:end] for key, value in self.observations.items()},
-            self.actions[:end],
-            self.rewards[:end],
-            self.costs[:end],
-            {key: value[:episodes] for key, value in self.final.items()},
-            self.offsets[: episodes + 1],
-            self.seeds[:episodes],
-            self.expert[:episodes],
-            {**self.card, "episodes": episodes, "transitions": int(end)},
+            {key: value[rows] for key, value in self.observations.items()},
+            self.actions[rows],
+            self.rewards[rows],
+            self.costs[rows],
+            {key: value[episodes] for key, value in self.final.items()},
+            offsets,
+            self.seeds[episodes],
+            self.expert[episodes],
+            {**self.card, "episodes": stop - start, "transitions": int(offsets[-1])},
         )
 
     def arrays(self) -> dict[str, NDArray]:

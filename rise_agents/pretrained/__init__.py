@@ -14,7 +14,7 @@ from rise_envs import ENVS
 
 FOLDER = Path(__file__).parent
 CARD = "card.json"
-_NAME = re.compile(r"[A-Za-z0-9][\w+-]*")
+_NAME = re.compile(r"[A-Za-z0-9][\w.-]*")
 
 
 def available() -> list[tuple[str, str]]:
@@ -50,7 +50,7 @@ def find(agent: str, env: str | None) -> Path:
 
 
 def is_name(text: str) -> bool:
-    """Whether a text can be the name of an agent, rather than of a file."""
+    """Whether a text can be the name of an agent or of a variant of one; a path in a folder cannot."""
     return _NAME.fullmatch(text) is not None
 
 

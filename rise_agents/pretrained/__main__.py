@@ -1,4 +1,8 @@
-"""Ship the agents of a benchmark run: copies their checkpoints, byte for byte; a card says where they come from."""
+"""Ship the agents of a benchmark run: copies their checkpoints; a card says where they come from.
+
+The copies are the run's files byte for byte, unless a row acts otherwise than its file says (rows that differ in
+nothing else share one): then it goes into the copy, so that who loads it by name gets what was measured.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from rise_agents import agent_class, checkpoint, load_agent
-from rise_agents.agent import nearest
+from rise_agents.agent import acting_settings, nearest
 from rise_agents.checkpoint import CheckpointError
 from rise_agents.cli import Parser, prepare_folder
 from rise_agents.files import replace_file
@@ -52,8 +56,11 @@ def read_run(folder: Path) -> dict[str, Any]:
     try:
         run = json.loads(path.read_text())
         kept = {key: run[key] for key in ("command", "agents", "demonstrations")}
+        kept["settings"], kept["variants"] = run.get("settings", {}), run.get("plan", {}).get("variants", {})
         texts = [text for paths in kept["agents"].values() for pair in paths.items() for text in pair]
         fits = isinstance(kept["command"], str) and all(isinstance(text, str) for text in texts)
+        told = [*kept["settings"].values(), *kept["variants"].values()]
+        fits = fits and all(isinstance(each, dict) for each in told)
     except (OSError, ValueError, LookupError, TypeError, AttributeError):
         fits = False
     if not fits:
@@ -77,6 +84,7 @@ def chosen(a: argparse.Namespace, agents: dict[str, dict[str, str]]) -> list[tup
     found = []
     for env in a.envs or agents:
         cut = {key.rpartition("-seed")[::2]: path for key, path in agents[env].items()}
+        # What stands behind a filter (pcbc+kalman) is no other agent, and its name none of an agent.
         own = {name: path for (name, seed), path in cut.items() if seed == str(a.seed) and is_name(name)}
         for name in a.agents or own:
             if name not in own:
@@ -88,18 +96,39 @@ def chosen(a: argparse.Namespace, agents: dict[str, dict[str, str]]) -> list[tup
     return found
 
 
-def entry(path: Path, env: str, run: dict[str, Any], note: str) -> dict[str, Any]:
-    """What the card says of a checkpoint.
+def acting(name: str, path: Path, env: str, run: dict[str, Any]) -> dict[str, Any]:
+    """The settings by which a row of the run acted, as far as its checkpoint says something else.
 
     Raises:
-        CheckpointError: it cannot be used.
+        CheckpointError: the checkpoint cannot be used.
+        ValueError: the run's settings are none of this agent.
     """
     load_agent(path, env)
     _, description = checkpoint.load(path)
+    settings = run["settings"].get(f"{name}@{env}", {})
+    told = {key: settings[key] for key in acting_settings(agent_class(description["agent"])) & set(settings)}
+    load_agent(path, env, settings=told)
+    return {key: value for key, value in told.items() if value != description["config"].get(key)}
+
+
+def copy(path: Path, target: Path, settings: dict[str, Any]) -> Path:
+    """Put a checkpoint to ``target``, with other ``settings`` if there are some."""
+    if not settings:
+        return replace_file(target, path.read_bytes())
+    arrays, description = checkpoint.load(path)
+    checkpoint.save(target, arrays, {**description, "config": {**description["config"], **settings}})
+    return target
+
+
+def entry(name: str, path: Path, env: str, run: dict[str, Any], note: str) -> dict[str, Any]:
+    """What the card says of a checkpoint that was put there."""
+    _, description = checkpoint.load(path)
     told = {key: description[key] for key in ("agent", "env", "seed", "config", "versions")}
     told |= {"sha256": sha256(path), "bytes": path.stat().st_size, "run": run["command"]}
-    if agent_class(description["agent"]).learns_from == "demonstrations" and env in run["demonstrations"]:
-        told["demonstrations"] = run["demonstrations"][env]
+    sets, expert = run["demonstrations"], run["variants"].get(name, {}).get("expert")
+    source = sets.get(f"{env} by {expert}", sets.get(env))  # a variant can have a demonstrator of its own
+    if agent_class(description["agent"]).learns_from == "demonstrations" and source:
+        told["demonstrations"] = source
     return {**told, "note": note} if note else told
 
 
@@ -107,19 +136,19 @@ def ship(a: argparse.Namespace) -> list[Path]:
     """Copy what the arguments ask for, and renew the card; returns the files.
 
     Raises:
-        ValueError: the run or the arguments make no sense.
+        ValueError: the run or the arguments make no sense; nothing was copied.
         CheckpointError: a checkpoint cannot be used; nothing was copied.
     """
     run = read_run(a.run)
     pieces = chosen(a, run["agents"])
-    entries = [entry(path, env, run, a.note) for _, env, path in pieces]
+    changes = [acting(name, path, env, run) for name, env, path in pieces]
     prepare_folder(a.into)
     card = a.into / CARD
     told = json.loads(card.read_text()) if card.exists() else {}
     made = []
-    for (name, env, path), words in zip(pieces, entries, strict=True):
-        made.append(replace_file(file_of(name, env, a.into), path.read_bytes()))
-        told[made[-1].name] = words
+    for (name, env, path), settings in zip(pieces, changes, strict=True):
+        made.append(copy(path, file_of(name, env, a.into), settings))
+        told[made[-1].name] = entry(name, made[-1], env, run, a.note)
     replace_file(card, (json.dumps(told, indent=2, sort_keys=True) + "\n").encode())
     return made
 

@@ -1,0 +1,161 @@
+"""Which work a plan asks for: what shares a file, what must not, and that rows act as their names say."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from benchmarks import results
+from benchmarks.jobs import (
+    check_settings,
+    checkpoint_path,
+    demonstrations_folder,
+    evaluate,
+    evaluation_jobs,
+    how_it_acts,
+    recording_jobs,
+    train,
+    training_jobs,
+    video_jobs,
+)
+from benchmarks.labels import TRUE, split_row
+from benchmarks.policies import make_policy
+from benchmarks.protocol import Scenarios, make_plan
+from rise_agents import load_agent
+from rise_agents.agent import silent
+from rise_agents.filters.kalman import KalmanFilter
+from rise_agents.rollout import rollout
+
+VEHICLE = "RISE-GroundVehicle-v0"
+
+
+def plan(*agents, settings=None, **chosen):
+    chosen = {"envs": (VEHICLE,), "noise_models": ("step",), "episodes": 4, "expert": "cbf", **chosen}
+    return make_plan("smoke", settings or {}, agents=agents, **chosen)
+
+
+def test_rows_that_differ_only_in_acting_share_one_training(tmp_path):
+    run = plan("rise", "rise-mean", "rise+kalman", "rise-mean+kalman", settings={"rise-mean": {"average": 3}})
+    (job,) = training_jobs(run, tmp_path, "cpu", 15.0)
+    assert {checkpoint_path(run, VEHICLE, row, 0, tmp_path) for row, _ in run.rows(VEHICLE)} == {job.output}
+    assert not {"posterior", "average"} & set(job.arguments["config"])
+    assert how_it_acts(run, VEHICLE, "rise-mean") == {"average": 3, "posterior": "mean"}
+    jobs = evaluation_jobs(run, tmp_path)
+    assert len({each.output for each in jobs}) == len(jobs) == 4
+    assert {each.needs for each in jobs} == {(job.output,)}
+    # The same row that acts otherwise is another evaluation of the same checkpoint.
+    again = plan("rise", settings={"rise": {"average": 3}})
+    (other,), (first, *_) = evaluation_jobs(again, tmp_path), jobs
+    assert other.needs == first.needs and other.output != first.output
+
+
+def test_equal_training_shares_a_file_and_other_training_does_not(tmp_path):
+    run = plan("rise", "rise-m1", "rise-cbf", "rise-mpc", "pcbc", "pcbc-noisy", "pcbc-body", "pcbc-world")
+    paths = {row: checkpoint_path(run, VEHICLE, row, 0, tmp_path) for row, _ in run.rows(VEHICLE)}
+    assert paths["rise-cbf"] == paths["rise"]  # cbf demonstrates to all in this run
+    assert paths["pcbc-body"] == paths["pcbc"]  # body is the default frame
+    assert len(set(paths.values())) == len(paths) - 2
+    assert len(training_jobs(run, tmp_path, "cpu", 15.0)) == len(paths) - 2
+
+
+def test_each_expert_demonstrates_into_its_own_folder(tmp_path):
+    run = plan("rise", "rise-mpc", "pcbc")
+    folders = [demonstrations_folder(run, VEHICLE, tmp_path, expert) for expert in ("cbf", "mpc")]
+    assert folders[0] == demonstrations_folder(run, VEHICLE, tmp_path) != folders[1]
+    collected = [job for job in recording_jobs(run, tmp_path) if "collect" in job.name]
+    assert [job.output.parent for job in collected] == folders
+    assert [job.arguments["expert"] for job in collected] == ["cbf", "mpc"]
+    data = {job.name: job.arguments["data"] for job in training_jobs(run, tmp_path, "cpu", 15.0)}
+    assert data[f"train rise-mpc on {VEHICLE}"] == folders[1]
+    assert data[f"train rise on {VEHICLE}"] == data[f"train pcbc on {VEHICLE}"] == folders[0]
+
+
+def test_several_noise_models_share_level_0(tmp_path):
+    run = plan("random", noise_models=("step", "episode"), noise_levels=(0.0, 1.0))
+    met = [
+        (job.arguments["noise_model"], job.arguments["noise_level"]) for job in evaluation_jobs(run, tmp_path)
+    ]
+    assert met == [("step", 0.0), ("step", 1.0), ("episode", 1.0)]
+    alone = plan("random", noise_levels=(0.0, 1.0))  # whose files are the same: nothing is done again
+    outputs = [job.output for job in evaluation_jobs(run, tmp_path)]
+    assert [job.output for job in evaluation_jobs(alone, tmp_path)] == outputs[:2]
+
+
+def test_a_row_on_true_readings_is_run_once_and_listed_everywhere(tmp_path):
+    run = plan("expert+true", "expert", noise_models=("step", "episode"), noise_levels=(0.0, 1.0))
+    jobs = [job for job in evaluation_jobs(run, tmp_path) if job.output.name.startswith("expert-cbf")]
+    true = [job for job in jobs if split_row(job.arguments.get("row", "x+true"))[1] == TRUE]
+    first, *others = true
+    assert len(others) == 2 and all(job.needs == (first.output,) for job in others)
+    for job in jobs:
+        job.run(job.output, silent, **job.arguments)
+    rows = {}
+    for job in jobs:
+        table = results.read_rows(job.output).to_pydict()
+        rows[table["agent"][0], table["noise_model"][0], table["noise_level"][0]] = table
+    outcome = [name for name in results.SCHEMA.names if name not in ("agent", "noise_model", "noise_level")]
+    clean = rows["expert-cbf", "step", 0.0]
+    for condition in (("step", 0.0), ("step", 1.0), ("episode", 1.0)):
+        table = rows["expert-cbf+true", *condition]
+        assert [table[name] for name in outcome] == [clean[name] for name in outcome]
+    assert rows["expert-cbf", "step", 1.0]["steps"] != clean["steps"]
+    for job in video_jobs(run, tmp_path):
+        assert job.arguments["noise_level"] == (0.0 if "+true" in job.arguments["row"] else 1.0)
+
+
+@pytest.fixture(scope="module")
+def trained(vehicle_demonstrations, tmp_path_factory):
+    """A plan of rows that share a checkpoint, the folder, and its path; trained by the job itself."""
+    out = tmp_path_factory.mktemp("run")
+    run = plan("rise", "rise-mean", "rise+kalman")
+    (job,) = training_jobs(run, out, "cpu", 15.0)
+    job.arguments["data"].mkdir(parents=True)
+    vehicle_demonstrations.save(job.arguments["data"])
+    job.output.parent.mkdir(parents=True)
+    train(job.output, silent, **{**job.arguments, "config": {**job.arguments["config"], "updates": 50}})
+    return run, out, job.output
+
+
+def test_rows_act_as_their_names_say(trained):
+    _, _, path = trained
+    mean = make_policy(VEHICLE, "rise-mean", path, {"posterior": "mean"}, 1.0)
+    assert mean.config.posterior == "mean" and load_agent(path).config.posterior == "sample"
+    kalman = make_policy(VEHICLE, "rise+kalman", path, {}, 1.5)
+    assert isinstance(kalman, KalmanFilter) and kalman.noise_level == 1.5
+    expert = make_policy(VEHICLE, "expert-cbf+kalman", None, {}, 1.0)
+    assert type(expert.policy).__name__ == "VehicleCBF"
+
+
+def test_evaluations_measure_the_row_they_name(trained, tmp_path):
+    """Against roll-outs that are put together by hand."""
+    run, out, path = trained
+    seeds = Scenarios(0, 4).seeds()
+    jobs = {job.arguments["row"]: job for job in evaluation_jobs(run, out)}
+    policies = {
+        "rise": load_agent(path),
+        "rise-mean": load_agent(path, None, "cpu", {"posterior": "mean"}),
+        "rise+kalman": KalmanFilter(load_agent(path), load_agent(path).task, 1.0),
+    }
+    returns = {}
+    for row, policy in policies.items():
+        evaluate(tmp_path / row, silent, **jobs[row].arguments)
+        table = results.read_rows(tmp_path / row)
+        episodes, _ = rollout(policy, VEHICLE, seeds, noise_level=1.0, deterministic=False)
+        returns[row] = table["episode_return"].to_numpy()
+        np.testing.assert_allclose(returns[row], episodes.episode_return, rtol=1e-6)
+        assert set(table["agent"].to_pylist()) == {row}
+    assert (returns["rise"] != returns["rise-mean"]).all() and (
+        returns["rise"] != returns["rise+kalman"]
+    ).all()
+
+
+def test_settings_out_of_range_name_the_row():
+    with pytest.raises(ValueError, match="settings of rise-mean: beta must not be negative"):
+        check_settings(plan("rise-mean+kalman", settings={"rise-mean": {"beta": -1.0}}))
+
+
+def test_clips_are_titled_with_the_row_s_label(tmp_path):
+    labels = {
+        job.arguments["row"]: job.arguments["label"] for job in video_jobs(plan("pcbc+kalman"), tmp_path)
+    }
+    assert labels == {"pcbc+kalman": "PC-BC behind a Kalman filter"}
