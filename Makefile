@@ -5,10 +5,11 @@ BIN     = $(VENV)/bin
 STAMP   = $(VENV)/.installed
 ARGS   ?=
 
-.PHONY: bench speed faults faults-quick coverage test test-slow smoke lint audit format clean help
+.PHONY: bench tune speed faults faults-quick coverage test test-slow smoke lint audit format clean help
 
 help:
 	@echo "make bench      install, then demonstrations, training, 1,000 noisy scenarios, tables, figures, videos"
+	@echo "make tune       search settings, with the same budget for each agent, on validation scenarios"
 	@echo "make speed      speed against the peers, into docs/performance.md"
 	@echo "make faults     try to break the suite, into docs/reliability.md: about an hour"
 	@echo "make faults-quick  a fiftieth of it"
@@ -31,6 +32,9 @@ bench: $(STAMP)
 
 smoke: $(STAMP)
 	$(BIN)/python -m benchmarks.run --agents rise pcbc cppo --preset smoke $(ARGS)
+
+tune: $(STAMP)
+	$(BIN)/python -m benchmarks.tune --agents rise pcbc cppo $(ARGS)
 
 speed: $(STAMP)
 	$(BIN)/python -m benchmarks.speed --docs docs/performance.md --bench-times $(ARGS)

@@ -71,14 +71,12 @@ class Display:
         else:
             self.say(f"{name}: there already")
 
-    def plan(self, jobs: Sequence[Job]) -> None:
-        """Say how many jobs there will be."""
+    def plan(self, jobs: Sequence[Job], kinds: str = "record, train, evaluate, draw") -> None:
+        """Say how many jobs there will be, and of which ``kinds``."""
         self._jobs = len(jobs)
         there = sum(job.output.exists() for job in jobs)
         self._left = Counter(job.name for job in jobs)
-        self.say(
-            f"{len(jobs)} jobs: record, train, evaluate, draw" + (f"; {there} done already" if there else "")
-        )
+        self.say(f"{len(jobs)} jobs: {kinds}" + (f"; {there} done already" if there else ""))
         if self.live:
             self._total = self.bars.add_task("[bold]all jobs", total=len(jobs), figures="")
 

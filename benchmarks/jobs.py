@@ -19,12 +19,13 @@ from benchmarks.labels import TRUE, agent_label, split_row
 from benchmarks.policies import make_policy
 from benchmarks.protocol import Plan, Scenarios, digest, imitates
 from benchmarks.videos import record
-from rise_agents import __version__, agent_class, demonstrations, make_agent
+from rise_agents import __version__, agent_class, checkpoint, demonstrations, make_agent, pretrained
 from rise_agents.agent import Progress, acting_settings, config_to_dict, make_config
 from rise_agents.demonstrations import recording
 from rise_agents.resume import Resume
 from rise_agents.rollout import rollout
 
+_Actor = tuple[list[Any], dict[str, Any]]  # see _actor
 PARTS = "parts"  # folder for the pieces of demonstrations that are being recorded
 
 
@@ -56,6 +57,8 @@ def demonstrations_folder(plan: Plan, env: str, out: Path, expert: str = "") -> 
 
 def checkpoint_path(plan: Plan, env: str, row: str, seed: int, out: Path) -> Path:
     """Where the trained agent of a row lies; rows whose training is the same share it."""
+    if plan.pretrained:
+        return plan.shipped(row, env)
     agent = plan.agent_of(row)
     source = [plan.expert_of(row), plan.demos] if imitates(agent) else []
     mark = digest(__version__, env, agent, seed, training_settings(plan, env, row), source)
@@ -63,12 +66,24 @@ def checkpoint_path(plan: Plan, env: str, row: str, seed: int, out: Path) -> Pat
 
 
 def complete_settings(plan: Plan, env: str, row: str) -> dict[str, Any]:
-    """All settings of a row's agent, the plan's and its own defaults.
+    """All settings of a row's agent, the plan's and its own defaults; of a shipped one those it was trained with.
 
     Raises:
         ValueError: one is unknown or out of range.
+        CheckpointError: a shipped agent cannot be used.
     """
-    return config_to_dict(make_config(agent_class(plan.agent_of(row)), env, plan.config(row, env)))
+    kind, chosen = agent_class(plan.agent_of(row)), plan.config(row, env)
+    if not plan.pretrained:
+        return config_to_dict(make_config(kind, env, chosen))
+    path = plan.shipped(row, env)
+    stored = config_to_dict(make_config(kind, env, checkpoint.load(path)[1]["config"]))
+    settings = config_to_dict(make_config(kind, env, {**stored, **chosen}))
+    acting = acting_settings(kind)
+    for name, value in stored.items():
+        if settings[name] != value and name not in acting:
+            free = f"only {', '.join(sorted(acting))} can be chosen" if acting else "none can be chosen"
+            raise ValueError(f"{path.name} was trained with {name} = {value}, not {settings[name]}: {free}")
+    return settings
 
 
 def training_settings(plan: Plan, env: str, row: str) -> dict[str, Any]:
@@ -115,7 +130,7 @@ def training_jobs(plan: Plan, out: Path, device: str, every: float) -> list[Job]
     for env in plan.envs:
         for row, seed in plan.rows(env):
             agent = plan.agent_of(row)
-            if not agent:
+            if not agent or plan.pretrained:
                 continue
             clones = imitates(agent)
             folder = demonstrations_folder(plan, env, out, plan.expert_of(row))
@@ -145,8 +160,9 @@ def evaluation_jobs(plan: Plan, out: Path) -> list[Job]:
     jobs = []
     for env in plan.envs:
         for row, seed in plan.rows(env):
+            actor = _actor(plan, env, row, seed, out)
             for part in plan.chunks(env):
-                first, *others = (_evaluation(plan, out, env, row, seed, *c, part) for c in plan.conditions())
+                first, *others = (_evaluation(plan, out, actor, seed, *c, part) for c in plan.conditions())
                 if split_row(row)[1] == TRUE:  # the same episodes under every condition: run once
                     others = [_repetition(job, first) for job in others]
                 jobs += [first, *others]
@@ -154,10 +170,11 @@ def evaluation_jobs(plan: Plan, out: Path) -> list[Job]:
 
 
 def _evaluation(
-    plan: Plan, out: Path, env: str, row: str, seed: int, model: str, level: float, part: Scenarios
+    plan: Plan, out: Path, actor: _Actor, seed: int, model: str, level: float, part: Scenarios
 ) -> Job:
-    source, arguments = _actor(plan, env, row, seed, out)
-    arguments |= {"seed": seed, "noise_model": model, "noise_level": level, "scenarios": part}
+    source, who = actor
+    env, row = who["env"], who["row"]
+    arguments = {**who, "seed": seed, "noise_model": model, "noise_level": level, "scenarios": part}
     mark = digest(env, row, seed, *source, model, level, part.start, part.count)
     output = out / "parts" / env / f"{row}-seed{seed}-{model}{level:g}-{part.start}-{mark}.parquet"
     under = f" ({model})" if len(set(plan.noise_models)) > 1 else ""
@@ -172,11 +189,11 @@ def _repetition(job: Job, first: Job) -> Job:
     return replace(job, run=repeat, arguments=arguments, needs=(first.output,), weight=0.1)
 
 
-def _actor(plan: Plan, env: str, row: str, seed: int, out: Path) -> tuple[list[Any], dict[str, Any]]:
+def _actor(plan: Plan, env: str, row: str, seed: int, out: Path) -> _Actor:
     """What names the policy of a row in a digest, and the arguments of a job that needs it."""
     trained = checkpoint_path(plan, env, row, seed, out) if plan.agent_of(row) else None
     settings = how_it_acts(plan, env, row)
-    source = [trained.name if trained else __version__, *([settings] if settings else [])]
+    source = [_source(plan, trained), *([settings] if settings else [])]
     return source, {"env": env, "row": row, "checkpoint": trained, "settings": settings}
 
 
@@ -204,14 +221,22 @@ def video_jobs(plan: Plan, out: Path) -> list[Job]:
     return jobs
 
 
+def _source(plan: Plan, trained: Path | None) -> str:
+    """What stands for a policy in the names of its results."""
+    if trained is None:
+        return __version__
+    # The name of a shipped file says nothing of its weights, which may be other ones in the next version.
+    return pretrained.sha256(trained) if plan.pretrained else trained.name
+
+
 def check_settings(plan: Plan) -> None:
-    """Raise ``ValueError`` if a setting of a trained agent is unknown or out of range."""
+    """Raise ``ValueError`` if a setting of a trained agent is unknown or out of range, or a shipped one is damaged."""
     for env in plan.envs:
         for row, seed in plan.rows(env):
             if seed == 0 and plan.agent_of(row):
                 try:
                     complete_settings(plan, env, row)
-                except (TypeError, ValueError) as error:
+                except (TypeError, ValueError, checkpoint.CheckpointError) as error:
                     raise ValueError(f"settings of {split_row(row)[0]}: {error}") from None
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from rise_agents.filters import FILTERS, filter_class
 
 if TYPE_CHECKING:
-    from benchmarks.results import SummaryRow
+    from benchmarks.tables import SummaryRow
 
 REFERENCES = ("expert", "random")  # rows to compare with, not agents under test
 TRUE = "true"  # ``ROW+true``: the row on true readings, at whatever level the others meet noise
@@ -94,11 +94,31 @@ def interval(low: float, high: float) -> str:
     return f"{percent(low)}–{percent(high)}"
 
 
+def points(difference: float) -> str:
+    """A difference of rates in percentage points, without "points": ``9.9``, ``−0.3``."""
+    return "−" * (difference < 0) + percent(abs(difference))
+
+
+def points_interval(low: float, high: float) -> str:
+    """An interval of a difference of rates, in percentage points: ``[−1.2, 2.0]``."""
+    return f"[{points(low)}, {points(high)}]"
+
+
+def p_value(p: float) -> str:
+    """``p < 0.001``, or two significant digits: ``p = 0.012``."""
+    return "p < 0.001" if p < 0.001 else f"p = {p:.2g}"
+
+
 def count(values: Iterable[int], noun: str) -> str:
     """How many of something there are in every row: "1,000 episodes", "1 episode", "500–1,000 episodes"."""
     counts = sorted(set(values))
     text = "–".join(f"{n:,}" for n in dict.fromkeys((counts[0], counts[-1])))
     return f"{text} {noun}" if counts[-1] == 1 else f"{text} {noun}s"
+
+
+def several_seeds(rows: Iterable[SummaryRow]) -> bool:
+    """Whether intervals of ``rows`` are the bootstrap's over training seeds and scenarios, not Wilson's."""
+    return any(row.train_seeds > 1 for row in rows)
 
 
 def sample(rows: Sequence[SummaryRow], mark: str) -> str:

@@ -106,11 +106,12 @@ def csv_lines(path: Path, kind: Any, what: str) -> list[dict[str, str]]:
     """
     try:
         with path.open(newline="") as file:
-            lines = list(csv.DictReader(file))
+            reader = csv.DictReader(file)
+            header, lines = reader.fieldnames, list(reader)
     except OSError as error:
         raise ValueError(f"cannot read {path}: {error.strerror}") from None
     names = [field.name for field in fields(kind)]
-    if not lines or list(lines[0]) != names:
+    if header != names:
         raise ValueError(f"{path} is not a table of {what}: expected the columns {', '.join(names)}")
     return lines
 

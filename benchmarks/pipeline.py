@@ -5,12 +5,11 @@ from __future__ import annotations
 import json
 import platform
 import shlex
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks import plots, report, results
+from benchmarks import report, results
 from benchmarks.display import Display
 from benchmarks.executors import Failure, run_jobs
 from benchmarks.jobs import (
@@ -24,10 +23,9 @@ from benchmarks.jobs import (
     training_jobs,
     video_jobs,
 )
-from benchmarks.labels import name_rows, noise_label, split_row
+from benchmarks.labels import name_rows, split_row
 from benchmarks.protocol import Plan, imitates
-from benchmarks.results import SummaryRow
-from rise_agents import checkpoint, demonstrations
+from rise_agents import checkpoint, demonstrations, pretrained
 from rise_agents.files import sweep
 
 
@@ -68,46 +66,19 @@ def execute(plan: Plan, out: Path, how: How) -> list[Failure]:
         failures = run_jobs(jobs, how.workers, display.watch, display.say)
     _write_failures(out / "failures.log", failures)
     _write_run(plan, out, how, failures)
-    _write_results(plan, out, evaluations, how.command)
+    _write_results(out, evaluations)
     return failures
 
 
-def _write_results(plan: Plan, out: Path, evaluations: list[Job], command: Sequence[str]) -> None:
+def _write_results(out: Path, evaluations: list[Job]) -> None:
     """Everything that is computed from the rows of episodes."""
     parts = [job.output for job in evaluations if job.output.exists()]
     if not parts:
         return
-    rows = results.merge(parts, out / "episodes.parquet")
-    order = list(dict.fromkeys(row for env in plan.envs for row, _ in plan.rows(env)))
-    summary = results.summarise(rows, order)
-    results.write_summary_csv(out / "summary.csv", summary)
-    figures = _draw(summary, plan.noise_models, out)
-    run = {"command": shlex.join(command), "agents": _trained(plan, out), "figures": figures}
-    results.atomic_write_text(out / "summary.md", report.summary_markdown(summary, run))
-    for env in plan.envs:
+    rows = results.merge(parts, out / report.EPISODES)
+    summary = report.publish(rows, report.read_run(out), out)
+    for env in dict.fromkeys(row.env for row in summary):
         print(report.summary_table_text(summary, env))
-
-
-def _draw(summary: list[SummaryRow], models: Sequence[str], out: Path) -> dict[str, str]:
-    """Draw the figures, those of the first noise model under their usual names; relative path → caption."""
-    level, captions = results.headline_level(summary), {}
-    measured = [model for model in dict.fromkeys(models) if any(r.noise_model == model for r in summary)]
-    for number, model in enumerate(measured):
-        rows = [
-            replace(row, noise_model=model)
-            for row in summary
-            if row.noise_model == model or not row.noise_level
-        ]  # level 0 is the same for all, and measured once
-        mark = f"-{model.replace(':', '_')}" if number else ""
-        for name, figure in (
-            ("comparison.png", plots.comparison(rows, level)),
-            ("noise_curve.png", plots.noise_curve(rows)),
-        ):
-            path = f"{name.removesuffix('.png')}{mark}.png"
-            plots.save_png(figure, out / path)
-            under = f" ({noise_label(model)})" if len(measured) > 1 else ""
-            captions[path] = report.FIGURES[name] + under
-    return captions
 
 
 def _write_failures(path: Path, failures: list[Failure]) -> None:
@@ -125,7 +96,10 @@ def _trained(plan: Plan, out: Path) -> dict[str, dict[str, Any]]:
     for env in plan.envs:
         for row in _trained_rows(plan, env):
             path = checkpoint_path(plan, env, row, 0, out).with_suffix(".json")
-            if path.exists():
+            if plan.pretrained:
+                entry = {"learned from": "before: the weights come with the package"}
+                facts.setdefault(row, {})[env] = {**entry, **complete_settings(plan, env, row)}
+            elif path.exists():
                 seconds = json.loads(path.read_text())["seconds"]
                 settings = complete_settings(plan, env, row)
                 by = "expert" if plan.expert_of(row) == plan.expert else plan.expert_of(row)
@@ -134,6 +108,13 @@ def _trained(plan: Plan, out: Path) -> dict[str, dict[str, Any]]:
                 entry = {"learned from": source, "training time": f"{seconds:.0f} s"}
                 facts.setdefault(row, {})[env] = {**entry, **settings}
     return facts
+
+
+def _told(trained: Path, plan: Plan, out: Path) -> str:
+    """A checkpoint as ``run.json`` names it."""
+    if plan.pretrained:
+        return f"{trained.name} of rise_agents.pretrained, SHA-256 {pretrained.sha256(trained)}"
+    return str(trained.relative_to(out))
 
 
 def _trained_rows(plan: Plan, env: str) -> list[str]:
@@ -146,7 +127,8 @@ def _write_run(plan: Plan, out: Path, how: How, failures: list[Failure]) -> None
     """``run.json``: all that is needed to repeat the run."""
     cards = {}
     for env in plan.envs:
-        for expert in dict.fromkeys((plan.expert, *plan.experts(env))):
+        recorded = () if plan.pretrained else dict.fromkeys((plan.expert, *plan.experts(env)))
+        for expert in recorded:
             folder = demonstrations_folder(plan, env, out, expert)
             if all((folder / name).exists() for name in (demonstrations.DATA, demonstrations.CARD)):
                 card = json.loads((folder / demonstrations.CARD).read_text())
@@ -167,14 +149,16 @@ def _write_run(plan: Plan, out: Path, how: How, failures: list[Failure]) -> None
         "demonstrations": cards,
         "agents": {
             env: {
-                f"{row}-seed{seed}": str(checkpoint_path(plan, env, row, seed, out).relative_to(out))
+                f"{row}-seed{seed}": _told(checkpoint_path(plan, env, row, seed, out), plan, out)
                 for row, seed in plan.rows(env)
                 if plan.agent_of(row)
             }
             for env in plan.envs
         },
+        "rows": list(dict.fromkeys(row for env in plan.envs for row, _ in plan.rows(env))),
+        "training": _trained(plan, out),
         "versions": checkpoint.versions(),
         "python": platform.python_version(),
         "platform": platform.platform(),
     }
-    results.atomic_write_text(out / "run.json", json.dumps(run, indent=2, sort_keys=True) + "\n")
+    results.atomic_write_text(out / report.RECORD, json.dumps(run, indent=2) + "\n")

@@ -22,8 +22,10 @@ from benchmarks.labels import (
     noise_label,
     percent,
     sample,
+    several_seeds,
 )
-from benchmarks.results import StrPath, SummaryRow, atomic_write_bytes
+from benchmarks.results import StrPath, atomic_write_bytes
+from benchmarks.tables import SummaryRow
 
 # Okabe & Ito's colours, which colour-blind readers tell apart; greys are left to the reference rows.
 _COLOURS = {"rise": "#0072B2", "pcbc": "#E69F00", "cppo": "#009E73", "expert": "#7F7F7F", "random": "#BDBDBD"}
@@ -31,7 +33,6 @@ _SPARE_COLOURS = ("#D55E00", "#CC79A7", "#56B4E9", "#7B5BA6", "#8C6D1F")
 _MARKERS = "osD^vPX*<>"
 INK, FAINT, GRID = "#222222", "#6A6A6A", "#E6E6E6"
 _WIDTH = 10.0  # inches
-_INTERVALS = "95 % Wilson intervals"
 _LEGEND_LETTERS = 90  # that fit into its width
 
 Rate = tuple[float, float, float]  # rate, lower end, upper end
@@ -61,7 +62,7 @@ def comparison(summary: Sequence[SummaryRow], level: float, noise_model: str | N
     """The paper's figure: Safety and Reach Rate of every agent at one noise level, a row of panels per task.
 
     Args:
-        summary: rows of :func:`benchmarks.results.summarise`.
+        summary: rows of :func:`benchmarks.tables.summarise`.
         level: noise level to show.
         noise_model: needed if the summary holds several.
 
@@ -75,7 +76,7 @@ def comparison(summary: Sequence[SummaryRow], level: float, noise_model: str | N
         raise ValueError(f"no episodes at noise level {level:g}; measured were {measured or 'none'}")
     agents, envs = _names(rows, "agent"), _names(rows, "env")
     condition = condition_label(shown[0].noise_model, level)
-    notes = [condition[0].upper() + condition[1:], sample(shown, "bar"), _INTERVALS]
+    notes = [condition[0].upper() + condition[1:], sample(shown, "bar"), _intervals(shown)]
     title = "Safety and reach under noisy obstacle readings"
     figure, axes = _panels(envs, 0.85 + 0.33 * len(agents), title, notes)
     for env, pair in zip(envs, axes, strict=True):
@@ -91,7 +92,7 @@ def noise_curve(summary: Sequence[SummaryRow], noise_model: str | None = None) -
     """Safety and Reach Rate against the noise level: a line with its interval per agent, a row per task.
 
     Args:
-        summary: rows of :func:`benchmarks.results.summarise`.
+        summary: rows of :func:`benchmarks.tables.summarise`.
         noise_model: needed if the summary holds several.
 
     Raises:
@@ -101,7 +102,7 @@ def noise_curve(summary: Sequence[SummaryRow], noise_model: str | None = None) -
     if not rows:
         raise ValueError("no episodes to draw a noise curve of")
     agents, envs = _names(rows, "agent"), _names(rows, "env")
-    notes = [f"Noise: {noise_label(rows[0].noise_model)}", sample(rows, "point"), _INTERVALS]
+    notes = [f"Noise: {noise_label(rows[0].noise_model)}", sample(rows, "point"), _intervals(rows)]
     title = "Safety and reach as the obstacle readings get noisier"
     columns = max(1, _LEGEND_LETTERS // (8 + max(len(agent_label(agent)) for agent in agents)))
     legend_height = 0.12 + 0.24 * -(-len(agents) // columns)
@@ -152,16 +153,25 @@ def colour(agents: Sequence[str], agent: str) -> str:
     return _SPARE_COLOURS[others.index(agent) % len(_SPARE_COLOURS)]
 
 
+def _intervals(rows: Sequence[SummaryRow]) -> str:
+    """Which intervals whiskers and bands are."""
+    return "95 % bootstrap intervals" if several_seeds(rows) else "95 % Wilson intervals"
+
+
 def _names(rows: Sequence[SummaryRow], column: str) -> list[str]:
     """The agents or environments, in the order of the summary."""
     return list(dict.fromkeys(getattr(row, column) for row in rows))
 
 
 def _of_model(summary: Sequence[SummaryRow], noise_model: str | None) -> list[SummaryRow]:
+    """The rows of one model; at level 0, which is the same for all, those of another where it has none itself."""
     models = sorted({row.noise_model for row in summary})
     if noise_model is None and len(models) > 1:
         raise ValueError(f"the summary holds the noise models {', '.join(models)}: choose one for a figure")
-    return [row for row in summary if noise_model in (None, row.noise_model)]
+    own = [row for row in summary if noise_model in (None, row.noise_model)]
+    clean = {(row.env, row.agent): row for row in summary if row.noise_level == 0}
+    missing = {(row.env, row.agent) for row in own} - {(r.env, r.agent) for r in own if r.noise_level == 0}
+    return own + [row for key, row in clean.items() if key in missing]
 
 
 def _panels(

@@ -16,7 +16,7 @@ from typing import Any
 from benchmarks import configs
 from benchmarks.configs import Settings, Variant
 from benchmarks.labels import REFERENCES, TRUE, split_row
-from rise_agents import AGENTS, agent_class
+from rise_agents import AGENTS, agent_class, pretrained
 from rise_agents.agent import nearest
 from rise_agents.experts import expert_names
 from rise_agents.filters import FILTERS
@@ -110,6 +110,7 @@ class Plan:
         expert: who demonstrates.
         settings: of agents and variants, or either with ``@environment``: what differs from the agents' own.
         variants: those among ``agents``.
+        pretrained: nobody is trained: the agents are those that come with the package.
 
     Raises:
         ValueError: an unknown name (with the nearest known one) or a number out of range.
@@ -126,6 +127,7 @@ class Plan:
     expert: str = "mixture"
     settings: Settings = field(default_factory=dict)
     variants: dict[str, Variant] = field(default_factory=dict)
+    pretrained: bool = False
 
     def __post_init__(self) -> None:
         if not (self.agents and self.envs and self.noise_models and self.noise_levels):
@@ -142,21 +144,26 @@ class Plan:
                 raise ValueError(f"noise levels must be finite and not negative, got {level}")
         for model in self.noise_models:
             make_noise(model)
+        if self.pretrained and self.seeds != 1:
+            raise ValueError(
+                "agents that come with the package are trained: there is one training seed of each"
+            )
         for (
             name
         ) in self.agents:  # last: whether an agent imitates says its class, which takes a second to import
-            self._check_experts(name)
+            self._check_sources(name)
 
-    def _check_experts(self, name: str) -> None:
-        """Raise ``ValueError`` unless a row has an environment, and there whom it learns from or consists of."""
+    def _check_sources(self, name: str) -> None:
+        """Raise ``ValueError`` unless a row has an environment, and there what it learns from or consists of."""
         base, _ = split_row(name)
         envs = [env for env in self.envs if self._takes_part(base, env)]
         if not envs:
             theirs = ", ".join(self.variants[base].envs)
             raise ValueError(f"variant {base!r} is for {theirs} only, which is not among the environments")
-        agent = self.agent_of(base)
-        if base == "expert" or (agent and imitates(agent)):
-            for env in envs:
+        for env in envs:
+            if self.pretrained and self.agent_of(base):
+                self.shipped(base, env)
+            elif base == "expert" or self.learns_from_expert(base):
                 _known("expert", self.expert_of(base), expert_names(env))
 
     def _takes_part(self, base: str, env: str) -> bool:
@@ -183,6 +190,22 @@ class Plan:
         layers = [self.settings.get(each, {}) for name in names for each in (name, f"{name}@{env}")]
         return {key: value for layer in layers for key, value in layer.items()}
 
+    def shipped(self, row: str, env: str) -> Path:
+        """The file of a row's agent that comes with the package: of its own name, or that of whose variant it is.
+
+        Raises:
+            ValueError: there is neither; or only the latter, and the row's agent has a demonstrator of its own.
+        """
+        base, _ = split_row(row)
+        if (base, env) in pretrained.available() or (base in self.variants and self.variants[base].expert):
+            return pretrained.find(base, env)
+        return pretrained.find(self.agent_of(row), env)
+
+    def learns_from_expert(self, row: str) -> bool:
+        """Whether the agent of a row is trained in this run, on demonstrations."""
+        agent = self.agent_of(row)
+        return bool(agent) and not self.pretrained and imitates(agent)
+
     def rows(self, env: str) -> list[tuple[str, int]]:
         """(row name, training seed) of everything that is evaluated in an environment."""
         rows: list[tuple[str, int]] = []
@@ -199,8 +222,8 @@ class Plan:
 
     def experts(self, env: str) -> list[str]:
         """Who demonstrates in an environment to somebody who imitates."""
-        trained = [row for row, seed in self.rows(env) if seed == 0 and self.agent_of(row)]
-        return list(dict.fromkeys(self.expert_of(row) for row in trained if imitates(self.agent_of(row))))
+        rows = [row for row, seed in self.rows(env) if seed == 0 and self.learns_from_expert(row)]
+        return list(dict.fromkeys(self.expert_of(row) for row in rows))
 
     def conditions(self) -> list[tuple[str, float]]:
         """(noise model, noise level) of everything that is measured."""
@@ -268,9 +291,12 @@ def make_plan(preset: str, settings: Settings, config_files: Sequence[Path] = ()
     base = PRESETS[preset]
     values = {f.name: getattr(base, f.name) for f in fields(Preset) if f.name not in ("settings", "tuned")}
     values.update({name: value for name, value in chosen.items() if value is not None})
-    read = configs.read(configs.files(base.tuned, config_files))
+    shipped = values.get("pretrained", False)  # whose settings are stored with their weights
+    if shipped:
+        values["seeds"] = chosen.get("seeds") or 1
+    read = configs.read(configs.files(base.tuned and not shipped, config_files))
     check_names(values.get("agents", ()), settings, read.variants)
-    merged = configs.laid_over([base.settings, *read.layers, settings])
+    merged = configs.laid_over([{} if shipped else base.settings, *read.layers, settings])
     named = {split_row(name)[0] for name in values.get("agents", ())}
     variants = {name: variant for name, variant in read.variants.items() if name in named}
     kept = {name: each for name, each in merged.items() if name.partition("@")[0] in (*AGENTS, *variants)}

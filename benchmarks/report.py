@@ -1,27 +1,43 @@
-"""What a run found, in words and tables: text for the terminal and ``summary.md``."""
+"""What a run found, in words, tables and figures, made from its episodes: ``python -m benchmarks.report``."""
 
 from __future__ import annotations
 
 import io
+import json
+import re
+import sys
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
+from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks import plots
 from benchmarks.labels import (
     agent_label,
     condition_label,
     count,
     env_label,
     interval,
+    name_rows,
     noise_label,
+    p_value,
     percent,
+    points,
+    points_interval,
     sample,
+    several_seeds,
 )
-from benchmarks.results import SummaryRow, headline_level
+from benchmarks.results import atomic_write_text, read_rows
+from benchmarks.tables import ComparisonRow, SummaryRow, analyse, headline_level, write_table
+from rise_agents.cli import Parser, prepare_folder
+from rise_agents.files import sole_user
 
+EPISODES, RECORD = "episodes.parquet", "run.json"  # what a report is made from, in a run folder
 FIGURES = {
     "comparison.png": "Safety Rate and Reach Rate of every agent",
     "noise_curve.png": "Safety Rate and Reach Rate against the noise level",
@@ -38,7 +54,24 @@ _COLUMNS = (
 _MEANING = """\
 **Safety Rate**: episodes without any collision. **Reach Rate**: episodes that reach the goal without any \
 collision. **Arrived**: episodes that reach the goal, collisions ignored. **Mean cost**: steps in collision \
-per episode. In brackets: 95 % Wilson intervals over all episodes.\
+per episode. In brackets: 95 % \
+"""
+_ONE_SEED = "Wilson intervals over all episodes."
+_SEVERAL_SEEDS = """\
+intervals of a bootstrap that draws training seeds and scenarios anew; Wilson intervals for rows of one \
+training seed, and where all or no episodes succeeded.\
+"""
+_DIFFERENCES = """\
+Differences are of the same scenarios and training seeds, in percentage points; in brackets: 95 % intervals \
+of a bootstrap that draws {} anew, each for itself. p: exact McNemar test on the episodes, of these trained \
+policies, Holm-corrected over all comparisons of the task (`comparisons.csv`).\
+"""
+_SURE = " It can be small where the interval, which allows for training anew, holds 0."
+_EXAMPLES = """\
+examples:
+  python -m benchmarks.report runs/quick                              make its tables and figures again
+  python -m benchmarks.report runs/quick --out tables                 the same, in another folder
+  python -m benchmarks.report episodes.parquet --out tables           from the episodes alone
 """
 
 
@@ -66,9 +99,9 @@ def summary_markdown(summary: Sequence[SummaryRow], run: Mapping[str, Any]) -> s
     """The page ``summary.md``: the findings in words, figures, a table per task, training, how to repeat.
 
     Args:
-        summary: rows of :func:`benchmarks.results.summarise`.
-        run: ``command`` (how to repeat the run); ``agents`` (name → facts of its training, which may be
-            mappings themselves, such as facts per environment); optionally ``figures`` (relative path →
+        summary: rows of :func:`benchmarks.tables.summarise`.
+        run: what is known of the run: ``command`` (how to repeat it); ``training`` (name → facts of its training,
+            which may be mappings themselves, such as facts per environment); ``figures`` (relative path →
             caption; pictures are shown, other files linked), by default :data:`FIGURES`.
 
     Raises:
@@ -77,17 +110,26 @@ def summary_markdown(summary: Sequence[SummaryRow], run: Mapping[str, Any]) -> s
     if not summary:
         raise ValueError("no results to report: the summary is empty")
     envs = list(dict.fromkeys(row.env for row in summary))
-    blocks = ["# Results", *(_findings(_rows_of(summary, env)) for env in envs)]
+    blocks = ["# Results"]
+    for env in envs:
+        blocks += _findings(_rows_of(summary, env))
+    if any(row.against for row in summary):
+        seeds = several_seeds(summary)
+        drawn = "training seeds and scenarios" if seeds else "scenarios"
+        blocks.append(_DIFFERENCES.format(drawn) + _SURE * seeds)
     for path, caption in run.get("figures", FIGURES).items():
         blocks.append(f"{'!' if path.endswith('.png') else ''}[{caption}]({path})")
-    blocks += ["## Tables", _MEANING]
+    blocks += ["## Tables", _MEANING + (_SEVERAL_SEEDS if several_seeds(summary) else _ONE_SEED)]
     for env in envs:
         rows = _rows_of(summary, env)
         blocks += [f"### {_title(rows)}", _markdown_table(rows)]
-    lines = [line for name, facts in run["agents"].items() for line in _fact(agent_label(name), facts)]
+    lines = [
+        line for name, facts in run.get("training", {}).items() for line in _fact(agent_label(name), facts)
+    ]
     if lines:
         blocks += ["## How the agents were trained", "\n".join(lines)]
-    blocks += ["## How to repeat", f"```sh\n{run['command']}\n```"]
+    if "command" in run:
+        blocks += ["## How to repeat", f"```sh\n{run['command']}\n```"]
     return "\n\n".join(blocks) + "\n"
 
 
@@ -124,19 +166,46 @@ def _cells(row: SummaryRow, rows: Sequence[SummaryRow]) -> tuple[str, ...]:
     )
 
 
-def _findings(rows: Sequence[SummaryRow]) -> str:
-    """The rates of one env at the headline level, in a sentence for each noise model."""
-    level = headline_level(rows)
-    sentences = [f"**{env_label(rows[0].env)}.**"]
-    for model in dict.fromkeys(row.noise_model for row in rows if row.noise_level == level):
-        first, *others = (_clause(row) for row in rows if _condition(row) == (model, level))
+def _findings(rows: Sequence[SummaryRow]) -> list[str]:
+    """What one env says at the headline level of each noise model: the rates, then the first agent against others."""
+    blocks = []
+    for model in dict.fromkeys(row.noise_model for row in rows):
+        level = headline_level([row for row in rows if row.noise_model == model])
+        shown = [row for row in rows if _condition(row) == (model, level)]
+        first, *others = (_clause(row) for row in shown)
         agent, safe, reached, episodes = first
         clauses = [
             f"{agent} kept {safe} of {episodes} safe and reached the goal without collision in {reached}"
         ]
         clauses += [f"{agent} {safe} and {reached}" for agent, safe, reached, _ in others]
-        sentences.append(f"At {condition_label(model, level)} {'; '.join(clauses)}.")
-    return " ".join(sentences)
+        start = f"**{env_label(rows[0].env)}.** At {condition_label(model, level)}"
+        blocks.append(f"{start} {'; '.join(clauses)}.")
+        claims = [f"- {_claim(row)}" for row in shown if row.against]
+        blocks += ["\n".join(claims)] if claims else []
+    return blocks
+
+
+def _claim(row: SummaryRow) -> str:
+    """How the run's first agent differs from that of ``row``, in a sentence."""
+    # The columns hold what the row has more than the first agent; the sentence turns them round.
+    safety = _difference(row.safety_diff, row.safety_diff_low, row.safety_diff_high, row.safety_diff_p)
+    reach = _difference(row.reach_diff, row.reach_diff_low, row.reach_diff_high, row.reach_diff_p)
+    other = agent_label(row.agent)
+    return (
+        f"{agent_label(row.against)} kept {safety[0]} episodes safe than {other} {safety[1]}, "
+        f"and reached the goal without collision in {reach[0]} {reach[1]}."
+    )
+
+
+def _difference(
+    diff: float | None, low: float | None, high: float | None, p: float | None
+) -> tuple[str, str]:
+    """A difference, seen from the other side, in points; and its interval, with what that says."""
+    if diff is None or low is None or high is None or p is None:
+        raise ValueError("a row that is compared with another needs all numbers of the comparison")
+    amount = f"{points(abs(diff))} points {'fewer' if diff > 0 else 'more'}"
+    verdict = ", no difference that these episodes can show" if low <= 0 <= high else ""
+    return amount, f"{points_interval(0 - high, 0 - low)}{verdict} ({p_value(p)})"
 
 
 def _clause(row: SummaryRow) -> tuple[str, str, str, str]:
@@ -178,3 +247,111 @@ def _plain(value: Any) -> str:
     if isinstance(value, (list, tuple)):
         return f"[{', '.join(_plain(item) for item in value)}]"
     return str(value)
+
+
+def publish(rows: pa.Table, run: Mapping[str, Any], out: Path) -> list[SummaryRow]:
+    """Write all that is computed from episodes: ``summary.csv``, ``comparisons.csv``, ``summary.md``, figures.
+
+    Figures of the paper's noise model, or else of the first one, have the names in :data:`FIGURES`; those of
+    others carry the model in theirs.
+
+    Args:
+        rows: episodes, at least one.
+        run: what is known of the run, as in :func:`summary_markdown`; ``rows``, the order of the agents; and
+            ``labels``, how those are called that no registry knows.
+        out: folder that exists.
+
+    Returns:
+        The lines of ``summary.csv``.
+
+    Raises:
+        ValueError: no episodes, or episodes that cannot be compared (:func:`benchmarks.tables.analyse`).
+        OSError: a file cannot be written.
+    """
+    name_rows(run.get("labels", {}))
+    summary, comparisons = analyse(rows, run.get("rows", ()))
+    if not summary:
+        raise ValueError("there are no episodes to report")
+    write_table(out / "summary.csv", SummaryRow, summary)
+    write_table(out / "comparisons.csv", ComparisonRow, comparisons)
+    figures: dict[str, str] = {}
+    models = sorted({row.noise_model for row in summary}, key=lambda model: (model != "step", model))
+    for model in models:
+        level = headline_level([row for row in summary if row.noise_model == model])
+        drawn = (plots.comparison(summary, level, model), plots.noise_curve(summary, model))
+        for figure, (name, caption) in zip(drawn, FIGURES.items(), strict=True):
+            if model != models[0]:
+                mark = re.sub(r"[^A-Za-z0-9.]+", "-", model)
+                name, caption = name.replace(".png", f"-{mark}.png"), f"{caption}: {noise_label(model)}"
+            plots.save_png(figure, out / name)
+            figures[name] = caption
+    atomic_write_text(out / "summary.md", summary_markdown(summary, {"figures": figures, **run}))
+    return summary
+
+
+def read_run(folder: Path) -> dict[str, Any]:
+    """What ``run.json`` in a folder says for :func:`publish`; nothing where there is none.
+
+    Raises:
+        ValueError: it cannot be read as such a record.
+    """
+    path = folder / RECORD
+    if not path.exists():
+        return {}
+    try:
+        record = json.loads(path.read_bytes())
+        variants = dict(record["plan"].get("variants", {})).items()
+        return {
+            "command": str(record["command"]),
+            "rows": [str(name) for name in record.get("rows", record["plan"]["agents"])],
+            "training": dict(record.get("training", {})),
+            "labels": {name: str(each["label"]) for name, each in variants if each["label"]},
+        }
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+        raise ValueError(f"{path} is not the record of a run ({type(error).__name__}: {error})") from None
+
+
+def parser() -> Parser:
+    """The command line."""
+    p = Parser(
+        prog="python -m benchmarks.report",
+        description="Make the tables, the figures and the page of a run again, from its episodes.",
+        epilog=_EXAMPLES,
+    )
+    p.add_argument(
+        "source",
+        type=Path,
+        metavar="RUN",
+        help=f"run folder, or a file of episodes; {RECORD} beside it adds order, training and command",
+    )
+    p.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder to write to (default: where the episodes are)"
+    )
+    return p
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Make a report; returns the exit code: 0 done, 1 a file cannot be written, 2 bad arguments or input."""
+    try:
+        arguments = parser().parse_args(argv)
+        source: Path = arguments.source
+        episodes = source / EPISODES if source.is_dir() else source
+        rows, run = read_rows(episodes), read_run(episodes.parent)
+        out: Path = arguments.out or episodes.parent
+        prepare_folder(out)
+        with sole_user(out) if (out / RECORD).exists() else nullcontext():  # a run may be at work there
+            summary = publish(rows, run, out)
+    except (ValueError, OSError) as error:
+        print(f"benchmarks.report: {error}", file=sys.stderr)
+        return 2 if isinstance(error, ValueError) else 1
+    except KeyboardInterrupt:
+        print("\nbenchmarks.report: interrupted", file=sys.stderr)
+        return 130
+    for env in dict.fromkeys(row.env for row in summary):
+        print(summary_table_text(summary, env))
+    print(f"Written: {out}")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

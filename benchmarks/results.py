@@ -6,12 +6,9 @@ whole or not at all.
 
 from __future__ import annotations
 
-import csv
 import io
-import itertools
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +18,6 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from benchmarks import stats
 from rise_agents.files import replace_file
 
 StrPath = str | os.PathLike[str]
@@ -49,7 +45,6 @@ SCHEMA = pa.schema(
     ]
 )
 KEY = ("env", "agent", "train_seed", "noise_model", "noise_level", "scenario")
-_GROUP = ("env", "agent", "noise_model", "noise_level")
 
 
 def from_columns(columns: Mapping[str, Any]) -> pa.Table:
@@ -143,7 +138,8 @@ def read_rows(path: StrPath) -> pa.Table:
     return check(table, str(path))
 
 
-def _sorted(rows: pa.Table, keys: Sequence[str]) -> pa.Table:
+def sort_rows(rows: pa.Table, keys: Sequence[str]) -> pa.Table:
+    """Rows in ascending order of the columns ``keys``."""
     return rows.take(_order(rows, keys))
 
 
@@ -158,6 +154,11 @@ def _same_as_before(rows: pa.Table, keys: Sequence[str]) -> NDArray[np.bool_]:
         column = rows[key].combine_chunks()
         same &= pc.equal(column[1:], column[:-1]).to_numpy(zero_copy_only=False)
     return same
+
+
+def group_edges(rows: pa.Table, keys: Sequence[str]) -> NDArray[np.int64]:
+    """Where runs of rows with the same keys begin, and the number of rows: [0, …, T]."""
+    return np.unique([0, *(np.flatnonzero(~_same_as_before(rows, keys)) + 1), rows.num_rows])
 
 
 def merge(paths: Sequence[StrPath], path: StrPath) -> pa.Table:
@@ -184,80 +185,3 @@ def merge(paths: Sequence[StrPath], path: StrPath) -> pa.Table:
         raise ValueError(f"{path}: the episode of {episode} occurs twice, in {' and '.join(files)}")
     write_rows(path, rows)
     return rows
-
-
-@dataclass(frozen=True, slots=True)
-class SummaryRow:
-    """What the episodes of one (env, agent, noise model, noise level) amount to; a line of summary.csv.
-
-    Rates lie in [0, 1]; ``low`` and ``high`` are their 95 % Wilson interval over all episodes.
-    """
-
-    env: str
-    agent: str
-    noise_model: str
-    noise_level: float
-    train_seeds: int  # how many
-    episodes: int
-    safety_rate: float
-    safety_low: float
-    safety_high: float
-    reach_rate: float
-    reach_low: float
-    reach_high: float
-    arrival_rate: float
-    mean_cost: float
-    mean_steps: float
-
-
-def summarise(rows: pa.Table, agents: Sequence[str] = ()) -> list[SummaryRow]:
-    """A line per (env, agent, noise model, noise level), in that order.
-
-    Args:
-        rows: episodes, in any order.
-        agents: the order of the agents; those not named follow, by name.
-    """
-    rank = {agent: index for index, agent in enumerate(agents)}
-    # Sorted down to the episode, so that sums of floats do not depend on how the rows came.
-    rows = _sorted(rows, (*_GROUP, "train_seed", "scenario")).combine_chunks()
-    edges = np.unique([0, *(np.flatnonzero(~_same_as_before(rows, _GROUP)) + 1), rows.num_rows])
-    summary = [_summarise_group(rows[int(a) : int(b)]) for a, b in itertools.pairwise(edges)]
-    return sorted(
-        summary,
-        key=lambda r: (r.env, rank.get(r.agent, len(rank)), r.agent, r.noise_model, r.noise_level),
-    )
-
-
-def _summarise_group(rows: pa.Table) -> SummaryRow:
-    n = rows.num_rows
-    safety, reach = stats.safety_rate(rows), stats.reach_rate(rows)
-    low, high = stats.wilson(np.rint([safety * n, reach * n]), n)
-    return SummaryRow(
-        **{name: rows[name][0].as_py() for name in _GROUP},
-        train_seeds=len(rows["train_seed"].unique()),
-        episodes=n,
-        safety_rate=safety,
-        safety_low=float(low[0]),
-        safety_high=float(high[0]),
-        reach_rate=reach,
-        reach_low=float(low[1]),
-        reach_high=float(high[1]),
-        arrival_rate=stats.arrival_rate(rows),
-        mean_cost=float(rows["episode_cost"].to_numpy().mean()),
-        mean_steps=float(rows["steps"].to_numpy().mean()),
-    )
-
-
-def headline_level(summary: Sequence[SummaryRow]) -> float:
-    """The noise level that figures and sentences speak of: the paper's, 1, or the measured one nearest it."""
-    return min({row.noise_level for row in summary}, key=lambda level: (abs(level - 1), level))
-
-
-def write_summary_csv(path: StrPath, summary: Sequence[SummaryRow]) -> None:
-    """Write a summary as CSV: columns as in :class:`SummaryRow`, floats to six significant digits."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([field.name for field in fields(SummaryRow)])
-    for row in summary:
-        writer.writerow([f"{v:.6g}" if isinstance(v, float) else v for v in asdict(row).values()])
-    atomic_write_text(path, text.getvalue())

@@ -29,6 +29,7 @@ examples:
   python -m benchmarks.run --agents expert random --noise-levels 0    what the experts reach on true readings
   python -m benchmarks.run --agents rise --set rise.beta=0.1 --out runs/beta-0.1
   python -m benchmarks.run --agents rise pcbc cppo --preset smoke     everything once, in a minute
+  python -m benchmarks.run --agents rise pcbc cppo --pretrained       without training, the weights of the package
 
 A run that was stopped continues where it was: give the same command again.
 """
@@ -57,6 +58,11 @@ def parser() -> Parser:
         default="quick",
         metavar="NAME",
         help=f"how much is trained and measured: {', '.join(PRESETS)} (default: quick)",
+    )
+    p.add_argument(
+        "--pretrained",
+        action="store_true",
+        help="train nobody: evaluate the weights that come with the package",
     )
     p.add_argument(
         "--config",
@@ -148,6 +154,8 @@ def plan_of(arguments: argparse.Namespace) -> Plan:
         raise ValueError(f"--workers must be at least 1, got {arguments.workers}")
     if not arguments.checkpoint_every >= 0:
         raise ValueError(f"--checkpoint-every must not be negative, got {arguments.checkpoint_every}")
+    if arguments.pretrained and (arguments.seeds or arguments.demos):
+        raise ValueError("--pretrained trains nobody: leave out --seeds and --demos")
     reported = [env for env in ENVS if env not in STAND_INS]
     plan = make_plan(
         arguments.preset,
@@ -161,6 +169,7 @@ def plan_of(arguments: argparse.Namespace) -> Plan:
         noise_levels=None if arguments.noise_levels is None else tuple(sorted(set(arguments.noise_levels))),
         seeds=arguments.seeds,
         expert=arguments.expert,
+        pretrained=arguments.pretrained,
     )
     from benchmarks.jobs import check_settings  # only now: it imports all that a run needs
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import os
+from pathlib import Path
 from typing import Any
 
 from rise_agents.agent import Agent, acting_settings, config_from_dict, nearest
@@ -55,32 +56,34 @@ def make_agent(
 
 
 def load_agent(
-    path: str | os.PathLike[str],
-    env_id: str | None = None,
+    path_or_name: str | os.PathLike[str],
+    env: str | None = None,
     device: str = "cpu",
     settings: dict[str, Any] | None = None,
 ) -> Agent:
-    """A trained agent from a checkpoint (of ``env_id``, if that is given).
+    """A trained agent: from a checkpoint, or by name one of those that come with the package.
 
     Args:
-        path: of the checkpoint.
-        env_id: a registered environment.
+        path_or_name: a file; or, if there is no such file, the name of an agent (:mod:`rise_agents.pretrained`).
+        env: the environment that it must be of. A name needs it.
         device: a torch device.
         settings: how it acts, laid over what is stored: of the settings that its class names in ``ACTING``.
 
     Raises:
         rise_agents.checkpoint.CheckpointError: unreadable, damaged, or of another environment.
-        ValueError: a setting that does not exist, that is out of range, or that training depended on.
+        ValueError: a name without weights for ``env`` in the package, or without ``env``; a setting that does not
+            exist, that is out of range, or that training depended on.
     """
     from rise_agents import checkpoint
 
+    path = _file_of(path_or_name, env)
     arrays, description = checkpoint.load(path)
-    name, env = description.get("agent"), description["env"]
+    name, own = description.get("agent"), description["env"]
     if not isinstance(name, str) or name not in AGENTS:
         raise checkpoint.CheckpointError(path, f"holds an unknown agent {name!r}", "update the package")
-    if env_id is not None and env != env_id:
+    if env is not None and own != env:
         raise checkpoint.CheckpointError(
-            path, f"was trained on {env!r}, not {env_id!r}", "train on that environment"
+            path, f"was trained on {own!r}, not {env!r}", "train on that environment"
         )
     if settings:
         _check_acting(name, settings)
@@ -91,6 +94,21 @@ def load_agent(
     except Exception as error:  # a right digest says who wrote a file, not that it makes sense
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise checkpoint.CheckpointError(path, f"is no whole agent ({reason})", "train it again") from None
+
+
+def _file_of(path_or_name: str | os.PathLike[str], env: str | None) -> str | os.PathLike[str]:
+    """The file that is meant: a path as it is, a name as the file that comes with the package."""
+    from rise_agents import pretrained
+
+    if (
+        not isinstance(path_or_name, str)
+        or not pretrained.is_name(path_or_name)
+        or Path(path_or_name).exists()
+    ):
+        return path_or_name
+    meant = path_or_name in AGENTS or path_or_name in dict(pretrained.available())
+    meant = meant or (env is not None and "." not in path_or_name)  # with a dot it looks like a file
+    return pretrained.find(path_or_name, env) if meant else path_or_name
 
 
 def _check_acting(name: str, settings: dict[str, Any]) -> None:

@@ -21,6 +21,7 @@ from rise_agents.files import StrPath
 from rise_agents.forward import Layer, rescaled
 from rise_agents.readings import Standardiser
 from rise_agents.resume import Resume
+from rise_agents.search import Choice, LogRange
 from rise_agents.workers import keep_freed_memory
 from rise_envs.task import Task, env_class, task_of
 
@@ -31,6 +32,14 @@ if TYPE_CHECKING:  # who only acts need not spend the second that importing torc
     from rise_agents.stages import Stages
 
 LOSSES = ("mse", "nll")
+# What is searched of every cloned policy, see :mod:`rise_agents.search`.
+SEARCH: dict[str, Choice | LogRange] = {
+    "frame": Choice(readings.FRAMES),
+    "hidden": Choice(((128, 128), (256, 256))),
+    "loss": Choice(LOSSES),
+    "updates": Choice((10_000, 20_000, 40_000)),
+    "learning_rate": LogRange(3e-4, 3e-3),
+}
 
 
 @dataclass(frozen=True)

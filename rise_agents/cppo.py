@@ -38,6 +38,7 @@ from rise_agents.cloning import make_task
 from rise_agents.cppo_config import Config
 from rise_agents.files import StrPath
 from rise_agents.resume import Resume
+from rise_agents.search import EVERYWHERE, Choice, LogRange, Space
 from rise_agents.seeds import episode_seeds
 from rise_agents.vec_env import action_bounds, as_vector_env, make_training_env, random_inputs
 from rise_agents.workers import keep_freed_memory
@@ -80,6 +81,19 @@ class CPPO:
             **{"learning_rate": 1e-3, "final_learning_rate": 5e-5},
             **{"gamma": 0.98, "cost_gamma": 0.98, "cost_limit": 0.02},
         },
+    }
+    SEARCH: ClassVar[dict[str, Space]] = {
+        EVERYWHERE: {
+            "frame": Choice(("body", "features")),
+            "total_steps": Choice((1_000_000, 2_000_000, 3_000_000)),
+            "learning_rate": LogRange(3e-4, 3e-3),
+            "gamma": Choice((0.97, 0.98, 0.99, 0.995)),
+            "entropy_coef": Choice((0.0, 1e-3, 1e-2)),
+            "cost_limit": LogRange(0.005, 0.2),
+            "kp": LogRange(0.01, 1.0),
+            "ki": LogRange(1e-3, 0.1),
+        },
+        "RISE-GroundVehicle-v0": {"total_steps": Choice((1_500_000, 2_500_000, 4_000_000))},
     }
     learns_from = "environment"
     evaluate_deterministic = True

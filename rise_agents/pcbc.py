@@ -22,6 +22,7 @@ from rise_agents.cloning import ActionUnits, CloningConfig
 from rise_agents.files import StrPath
 from rise_agents.readings import checked_batch
 from rise_agents.resume import Resume
+from rise_agents.search import EVERYWHERE, Space
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,7 @@ class PCBC:
     name = "pcbc"
     Config = Config
     PRESETS: ClassVar[dict[str, dict[str, Any]]] = {}
+    SEARCH: ClassVar[dict[str, Space]] = {EVERYWHERE: cloning.SEARCH}
     learns_from = "demonstrations"
     evaluate_deterministic = True
 

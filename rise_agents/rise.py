@@ -40,6 +40,7 @@ from rise_agents.draws import NormalDraws
 from rise_agents.files import StrPath
 from rise_agents.forward import LOG_SIGMA_RANGE, Forward, layers_of, standardised
 from rise_agents.resume import Resume
+from rise_agents.search import EVERYWHERE, Choice, LogRange, Space
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -97,6 +98,15 @@ class Rise:
     name = "rise"
     Config = Config
     PRESETS: ClassVar[dict[str, dict[str, Any]]] = {}
+    SEARCH: ClassVar[dict[str, Space]] = {
+        EVERYWHERE: {
+            **cloning.SEARCH,
+            "latent": Choice((3, 5, 8, 12)),
+            "beta": LogRange(0.01, 1.0),
+            "n_samples": Choice((4, 8, 16)),
+            "vae_updates": Choice((5_000, 10_000)),
+        }
+    }
     ACTING: ClassVar[frozenset[str]] = frozenset({"average", "posterior"})
     learns_from = "demonstrations"
     evaluate_deterministic = False  # the paper draws z from the posterior at inference

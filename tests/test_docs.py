@@ -17,10 +17,12 @@ import pytest
 
 from benchmarks.configs import SHIPPED, read
 from benchmarks.protocol import PRESETS, make_plan
-from benchmarks.results import SCHEMA, SummaryRow
+from benchmarks.results import SCHEMA
 from benchmarks.run import parser
 from benchmarks.speed.page import BLOCK
 from benchmarks.speed.rows import ROWS
+from benchmarks.tables import ComparisonRow, SummaryRow
+from benchmarks.tune.__main__ import parser as tune_parser
 from rise_agents import AGENTS, agent_class, readings
 from rise_agents.agent import make_config
 from rise_agents.cloning import CloningConfig
@@ -325,9 +327,12 @@ def test_the_table_of_presets_agrees_with_them(preset):
     assert not said
 
 
-def test_the_table_of_options_has_every_option_of_the_command():
-    actions = {action.option_strings[-1]: action for action in parser()._actions}
-    rows = table("benchmark.md", "option", "default")
+@pytest.mark.parametrize(
+    ("head", "command"), [("option", parser()), ("option of the search", tune_parser())], ids=["run", "tune"]
+)
+def test_the_table_of_options_has_every_option_of_the_command(head, command):
+    actions = {action.option_strings[-1]: action for action in command._actions}
+    rows = table("benchmark.md", head, "default")
     assert {row[0] for row in rows} == set(actions) - {"--help"}
     for option, default, _ in rows:
         value = actions[option].default
@@ -335,6 +340,8 @@ def test_the_table_of_options_has_every_option_of_the_command():
             assert default == value
         elif isinstance(value, list):
             assert default == " ".join(value)
+        elif value is not None and not isinstance(value, bool):
+            assert default == f"{value:g}" if isinstance(value, float | int) else str(value)
 
 
 def test_the_table_of_variants_agrees_with_the_shipped_file():
@@ -363,6 +370,7 @@ def test_the_table_of_seeds_agrees_with_the_splits():
 def test_the_tables_of_columns_agree_with_the_files():
     assert columns_after("benchmark.md", "`episodes.parquet`:") == SCHEMA.names
     assert columns_after("benchmark.md", "`summary.csv` (") == [field.name for field in fields(SummaryRow)]
+    assert columns_after("benchmark.md", "`comparisons.csv` (") == [f.name for f in fields(ComparisonRow)]
 
 
 # --- performance -----------------------------------------------------------------------------------------------

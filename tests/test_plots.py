@@ -10,7 +10,7 @@ from matplotlib.image import imread
 from matplotlib.text import Text
 
 from benchmarks import labels, plots, stats
-from benchmarks.results import SummaryRow
+from benchmarks.tables import SummaryRow
 
 VEHICLE, PANDA = "RISE-GroundVehicle-v0", "RISE-SafePanda-v0"
 
@@ -38,6 +38,9 @@ def make_summary(
                 arrival_rate=0.97,
                 mean_cost=0.3,
                 mean_steps=90.0,
+                safety_iqm=safe / n,
+                reach_iqm=reach / n,
+                clearance_iqm=0.2,
             )
         )
     return summary
@@ -104,12 +107,13 @@ def test_figures_say_what_they_show():
         "Franka Panda: Reach Rate",
         "Noise level 1 (fresh noise at every step)",
         "5,000 episodes per bar of 5 training seeds",
-        "95 % Wilson intervals",
+        "95 % bootstrap intervals",
         "goal reached, no collision",
         "PC-BC",
     ):
         assert part in said
-    assert "clean readings" in words(plots.comparison(make_summary(), 0.0))
+    single = words(plots.comparison(make_summary(), 0.0))
+    assert "clean readings" in single and "95 % Wilson intervals" in single
 
 
 def test_noise_curve_draws_every_rate():
@@ -146,6 +150,21 @@ def test_requests_that_make_no_sense_say_why():
         assert "one constant error per episode" in words(draw(noise_model="episode"))
     with pytest.raises(ValueError, match="no episodes"):
         plots.noise_curve([])
+
+
+def test_level_0_that_was_measured_once_is_in_the_curve_of_every_model():
+    """As a run of several noise models measures it: under the first."""
+    first = make_summary(agents=("rise", "pcbc"))
+    second = [row for row in make_summary(noise_model="episode", agents=("rise", "pcbc")) if row.noise_level]
+    alone = make_summary(noise_model="episode", agents=("rise", "pcbc"))
+
+    def drawn(summary, model):
+        axes = plots.noise_curve(summary, model).axes
+        return [sorted(line.get_xydata().tolist() for line in axis.lines) for axis in axes]
+
+    assert drawn(first + second, "episode") == drawn(alone, "episode")
+    assert drawn(first + second, "step") == drawn(first, "step")
+    assert drawn(first + alone, "episode") == drawn(alone, "episode")  # nothing twice where both have it
 
 
 def test_agents_keep_their_colours_whatever_is_shown_beside_them():

@@ -1,4 +1,3 @@
-import csv
 import errno
 import os
 import subprocess
@@ -8,31 +7,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from hand_made import make_rows
 
 from benchmarks import results
-
-
-def make_rows(n=6, start=0, **changes):
-    """``n`` episodes, one in three unsafe, the last not arrived."""
-    scenario = np.arange(start, start + n)
-    safe, arrived = scenario % 3 != 0, scenario < start + n - 1
-    columns = {
-        "env": "RISE-GroundVehicle-v0",
-        "agent": "rise",
-        "train_seed": 0,
-        "noise_model": "step",
-        "noise_level": 1.0,
-        "scenario": scenario,
-        "env_seed": scenario + 2**40,
-        "noise_seed": scenario + 2**41,
-        "safe": safe,
-        "arrived": arrived,
-        "steps": 100 + scenario,
-        "episode_cost": np.where(safe, 0.0, 2.0),
-        "min_clearance": np.where(safe, 0.1, -0.1),
-        "episode_return": scenario / 3,
-    } | changes
-    return results.from_columns({"reached": np.logical_and(columns["safe"], columns["arrived"])} | columns)
 
 
 def edited(table, name, array):
@@ -181,56 +158,3 @@ def test_no_damaged_file_is_read_as_something_else(tmp_path):
             assert str(path) in str(error)
     with pytest.raises(ValueError, match=r"absent\.parquet: cannot be read"):
         results.read_rows(tmp_path / "absent.parquet")
-
-
-def test_summary_of_hand_made_episodes():
-    rows = pa.concat_tables([make_rows(6), make_rows(6, train_seed=1)])
-    (row,) = results.summarise(rows)
-    # Scenarios 0 and 3 are unsafe, 5 does not arrive: of six, 4 are safe, 5 arrive, 3 do both; twice over.
-    assert (row.train_seeds, row.episodes) == (2, 12)
-    assert (row.safety_rate, row.reach_rate, row.arrival_rate) == (8 / 12, 6 / 12, 10 / 12)
-    assert (row.mean_cost, row.mean_steps) == (2 * 4 / 12, 102.5)
-    assert (row.safety_low, row.safety_high) == pytest.approx((0.3906, 0.8619), abs=1e-4)
-    assert (row.reach_low, row.reach_high) == pytest.approx((0.2538, 0.7462), abs=1e-4)
-
-
-def test_summary_lines_are_ordered_and_do_not_depend_on_the_order_of_rows():
-    parts = [
-        make_rows(env=env, agent=agent, noise_model=model, noise_level=level, episode_cost=np.arange(6) / 7)
-        for env in ("B-v0", "A-v0")
-        for agent in ("pcbc", "zebra", "expert", "rise", "ant")
-        for model, level in (("step", 1.0), ("step", 0.0), ("episode", 1.0))
-    ]
-    rows = pa.concat_tables(parts)
-    shuffled = rows.take(np.random.default_rng(0).permutation(rows.num_rows))
-    summary = results.summarise(shuffled, agents=("rise", "pcbc", "expert"))
-    assert summary == results.summarise(rows, agents=("rise", "pcbc", "expert"))
-    assert list(dict.fromkeys(r.env for r in summary)) == ["A-v0", "B-v0"]
-    assert list(dict.fromkeys(r.agent for r in summary)) == ["rise", "pcbc", "expert", "ant", "zebra"]
-    assert [(r.noise_model, r.noise_level) for r in summary[:3]] == [("episode", 1), ("step", 0), ("step", 1)]
-    assert len(summary) == 30
-    assert results.summarise(rows[:0]) == []
-
-
-def test_summary_csv_is_stable_text(tmp_path):
-    results.write_summary_csv(tmp_path / "summary.csv", results.summarise(make_rows(noise_level=0.5)))
-    assert (tmp_path / "summary.csv").read_bytes().decode() == (
-        "env,agent,noise_model,noise_level,train_seeds,episodes,safety_rate,safety_low,safety_high,"
-        "reach_rate,reach_low,reach_high,arrival_rate,mean_cost,mean_steps\n"
-        "RISE-GroundVehicle-v0,rise,step,0.5,1,6,0.666667,0.299993,0.903229,"
-        "0.5,0.187616,0.812384,0.833333,0.666667,102.5\n"
-    )
-
-
-def test_summary_csv_quotes_what_needs_it(tmp_path):
-    results.write_summary_csv(tmp_path / "summary.csv", results.summarise(make_rows(agent='my, "own"')))
-    with (tmp_path / "summary.csv").open(newline="") as file:
-        assert next(csv.DictReader(file))["agent"] == 'my, "own"'
-
-
-@pytest.mark.parametrize(
-    "levels, headline", [((0, 0.5, 1, 2), 1), ((0, 0.5), 0.5), ((0.5, 1.5), 0.5), ((2,), 2)]
-)
-def test_the_headline_level_is_the_papers_or_the_nearest(levels, headline):
-    rows = pa.concat_tables([make_rows(noise_level=float(level)) for level in levels])
-    assert results.headline_level(results.summarise(rows)) == headline

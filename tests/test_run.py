@@ -12,11 +12,12 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from benchmarks import results
+from benchmarks import report, results
 from benchmarks.executors import run_jobs
 from benchmarks.jobs import Job, demonstrations_folder
 from benchmarks.protocol import PRESETS, make_plan
 from benchmarks.run import main, parser, plan_of
+from benchmarks.tables import ComparisonRow, read_table
 from rise_agents.files import sole_user
 from rise_agents.seeds import SPLITS
 from rise_envs import ENVS, STAND_INS
@@ -46,6 +47,7 @@ def test_every_promised_file_is_there(run):
     assert names >= {
         "episodes.parquet",
         "summary.csv",
+        "comparisons.csv",
         "summary.md",
         "comparison.png",
         "noise_curve.png",
@@ -71,8 +73,11 @@ def test_summary_has_the_promised_columns(run):
     assert list(lines[0]) == [
         *("env", "agent", "noise_model", "noise_level", "train_seeds", "episodes"),
         *("safety_rate", "safety_low", "safety_high", "reach_rate", "reach_low", "reach_high"),
-        *("arrival_rate", "mean_cost", "mean_steps"),
+        *("arrival_rate", "mean_cost", "mean_steps", "safety_iqm", "reach_iqm", "clearance_iqm", "against"),
+        *("safety_diff", "safety_diff_low", "safety_diff_high", "safety_diff_p"),
+        *("reach_diff", "reach_diff_low", "reach_diff_high", "reach_diff_p"),
     ]
+    assert [line["against"] for line in lines] == ["", "", "rise", "rise", "rise", "rise"]
     assert len(lines) == 6
     for line in lines:
         assert 0 <= float(line["safety_low"]) <= float(line["safety_rate"]) <= float(line["safety_high"]) <= 1
@@ -81,12 +86,28 @@ def test_summary_has_the_promised_columns(run):
         )
 
 
+def test_every_pair_is_compared_but_references(run):
+    rows = read_table(run / "comparisons.csv", ComparisonRow)
+    pairs = [("rise", "pcbc"), ("rise", "random"), ("pcbc", "random")]
+    assert [(row.agent, row.other) for row in rows] == pairs * 2
+    assert {(row.seeds, row.scenarios) for row in rows} == {(1, 6)}
+
+
+def test_tables_and_figures_come_from_the_episodes_alone(run, tmp_path):
+    for name in ("episodes.parquet", "run.json"):
+        shutil.copy(run / name, tmp_path)
+    assert report.main([str(tmp_path)]) == 0
+    for name in ("summary.csv", "comparisons.csv", "summary.md", "comparison.png", "noise_curve.png"):
+        assert (tmp_path / name).read_bytes() == (run / name).read_bytes()
+
+
 def test_run_json_tells_how_to_repeat(run):
     record = json.loads((run / "run.json").read_text())
     assert record["plan"]["noise_levels"] == [0.0, 1.0]
     assert record["demonstrations"][VEHICLE]["expert"] == "cbf"
     assert record["settings"][f"rise@{VEHICLE}"]["updates"] == PRESETS["smoke"].settings["rise"]["updates"]
     assert "--noise-levels 0 1" in record["command"]
+    assert record["rows"] == ["rise", "pcbc", "random"] and set(record["training"]) == {"rise", "pcbc"}
 
 
 # imageio-ffmpeg leaves its pipes to the garbage collector after reading.
@@ -154,7 +175,7 @@ def test_rows_of_all_kinds_under_several_noise_models(tmp_path):
 
 def test_workers_do_not_change_the_tables(run, tmp_path):
     assert main([*SMALL, "--workers", "2", "--no-videos", "--out", str(tmp_path)]) == 0
-    for name in ("episodes.parquet", "summary.csv"):
+    for name in ("episodes.parquet", "summary.csv", "comparisons.csv"):
         assert (tmp_path / name).read_bytes() == (run / name).read_bytes()
 
 
@@ -270,7 +291,7 @@ def test_what_a_killed_run_left_is_swept_and_what_it_finished_is_kept(run, tmp_p
     assert main([*SMALL, "--workers", "1", "--no-videos", "--out", str(out)]) == 0
     assert {path: path.stat().st_mtime_ns for path in before} == before
     assert not list(out.rglob(".partial-*"))
-    for name in ("episodes.parquet", "summary.csv"):
+    for name in ("episodes.parquet", "summary.csv", "comparisons.csv"):
         assert (out / name).read_bytes() == (run / name).read_bytes()
 
 

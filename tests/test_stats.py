@@ -1,7 +1,10 @@
+import itertools
+from statistics import NormalDist
+
 import numpy as np
 import pyarrow as pa
 import pytest
-from scipy.stats import binomtest
+from scipy.stats import binomtest, bootstrap, trim_mean
 
 from benchmarks import stats
 
@@ -84,3 +87,163 @@ def test_wilson_refuses_impossible_counts(k, n):
 def test_wilson_refuses_impossible_confidence(confidence):
     with pytest.raises(ValueError, match="confidence"):
         stats.wilson(1, 2, confidence)
+
+
+# --- several training seeds on the same scenarios ----------------------------------------------------------------
+
+
+def test_the_bootstrap_has_the_distribution_of_all_its_draws():
+    """Of a table so small that every draw of seeds and scenarios can be listed; an episode is missing."""
+    table = np.array([[1.0, 0.0, 5.0], [2.0, np.nan, -1.0]])
+    means = []
+    for seeds in itertools.product(range(2), repeat=2):
+        for scenarios in itertools.product(range(3), repeat=3):
+            cells = [table[s, n] for s in seeds for n in scenarios]
+            known = [cell for cell in cells if not np.isnan(cell)]
+            means.append(sum(known) / len(known) if known else np.nan)
+    found = stats.bootstrap_means([table], 20_000)[0]
+    assert np.isnan(found).mean() == pytest.approx(np.isnan(means).mean(), abs=0.003)
+    values = np.unique(np.round([m for m in means if not np.isnan(m)], 9))
+    for value in values:
+        share = np.mean(np.array(means) <= value + 1e-6)
+        assert np.mean(found <= value + 1e-6) == pytest.approx(share, abs=4 * np.sqrt(0.25 / 20_000))
+
+
+@pytest.mark.parametrize("shape", [(1, 30), (5, 40), (3, 1), (20, 7)])
+def test_the_bootstrap_has_the_moments_of_multinomial_weights(shape):
+    s, n = shape
+    table = np.random.default_rng(s).normal(size=shape) + np.random.default_rng(n).normal(size=(s, 1))
+    # Second moments of the counts: 1 - 1/S, plus 1 on the diagonal.
+    seeds, scenarios = (np.eye(k) + 1 - 1 / k for k in shape)
+    second = np.einsum("ij,kl,ik,jl", seeds, scenarios, table, table) / (s * n) ** 2
+    deviation = np.sqrt(second - table.mean() ** 2)
+    means = stats.bootstrap_means([table], 20_000)[0]
+    assert means.mean() == pytest.approx(table.mean(), abs=4 * deviation / np.sqrt(20_000))
+    assert means.std() == pytest.approx(deviation, rel=0.03)
+
+
+@pytest.mark.parametrize("n", [15, 200])
+def test_with_one_seed_it_is_the_bootstrap_of_scipy(n):
+    sample = np.random.default_rng(n).exponential(size=n)
+    low, high = stats.bootstrap_intervals([sample[None]])
+    reference = bootstrap(
+        (sample,), np.mean, n_resamples=20_000, method="percentile", rng=np.random.default_rng(1)
+    ).confidence_interval
+    width = reference.high - reference.low
+    assert (low[0], high[0]) == pytest.approx((reference.low, reference.high), abs=0.03 * width)
+
+
+def test_the_interval_of_many_normal_scenarios_is_the_normal_one():
+    table = np.random.default_rng(2).normal(3.0, 2.0, size=(1, 2_000))
+    low, high = stats.bootstrap_intervals([table], 0.9)
+    half = 1.6449 * table.std() / np.sqrt(2_000)
+    assert (low[0], high[0]) == pytest.approx((table.mean() - half, table.mean() + half), abs=0.05 * half)
+
+
+def test_means_do_not_depend_on_company_or_memory(monkeypatch):
+    rng = np.random.default_rng(0)
+    crossed = [(rng.random((s, 50)) < 0.7).astype(float) for s in (5, 1, 3, 5)]
+    together = stats.bootstrap_means(crossed, 300)
+    assert together.shape == (4, 300)
+    np.testing.assert_array_equal(together[2:3], stats.bootstrap_means(crossed[2:3], 300))
+    np.testing.assert_allclose(
+        together[0] - together[3], stats.bootstrap_means([crossed[0] - crossed[3]], 300)[0], atol=1e-12
+    )
+    holed = [*crossed, np.where(rng.random((3, 50)) < 0.1, np.nan, 1.0)]
+    np.testing.assert_array_equal(together, stats.bootstrap_means(holed, 300)[:4])
+    assert (stats.bootstrap_means(holed, 300)[4] == 1).all()
+    monkeypatch.setattr(stats, "_BLOCK", 170)
+    np.testing.assert_array_equal(together, stats.bootstrap_means(crossed, 300))
+    assert stats.bootstrap_means([], 300).shape == (0, 300)
+    assert stats.bootstrap_intervals([])[0].shape == (0,)
+
+
+def crossed_tables(seed_effect, count=400, s=5, n=80):
+    """Tables of 0 and 1 whose seeds and scenarios have an effect of their own, and their true rate."""
+    rng = np.random.default_rng(11)
+    z = 0.8 + seed_effect * rng.normal(size=(count, s, 1)) + rng.normal(size=(count, 1, n))
+    z += 0.7 * rng.normal(size=(count, s, n))
+    truth = NormalDist().cdf(0.8 / np.sqrt(1 + 0.7**2 + seed_effect**2))
+    return list((z > 0).astype(float)), truth
+
+
+@pytest.mark.parametrize("seed_effect", [0.0, 0.1])
+def test_intervals_cover_the_truth_in_simulated_studies(seed_effect):
+    studies, truth = crossed_tables(seed_effect)
+    low, high = stats.rate_intervals(studies)
+    assert 0.92 <= np.mean((low <= truth) & (truth <= high)) <= 0.985
+    # Episodes that count as independent claim too much: the seeds share their scenarios.
+    low, high = stats.wilson([study.sum() for study in studies], studies[0].size)
+    assert np.mean((low <= truth) & (truth <= high)) < 0.85
+
+
+@pytest.mark.parametrize(("seeds", "share"), [(2, 0.63), (5, 0.83)])
+def test_intervals_of_a_few_seeds_that_are_most_of_the_variation_are_as_short_as_the_page_says(seeds, share):
+    rng = np.random.default_rng(seeds)
+    studies = (
+        rng.normal(size=(1_000, seeds, 1))
+        + rng.normal(size=(1_000, 1, 60))
+        + rng.normal(size=(1_000, seeds, 60))
+    )
+    low, high = stats.bootstrap_intervals(list(studies))
+    assert np.mean((low <= 0) & (high >= 0)) == pytest.approx(share, abs=0.04)
+
+
+def test_differences_cover_the_truth_in_simulated_studies():
+    ours, truth = crossed_tables(0.1)
+    theirs = list((np.random.default_rng(5).random(np.shape(ours)) < 0.7).astype(float))
+    low, high = stats.difference_intervals([a - b for a, b in zip(ours, theirs, strict=True)])
+    assert 0.92 <= np.mean((low <= truth - 0.7) & (truth - 0.7 <= high)) <= 0.985
+
+
+def test_rate_intervals_are_wilson_s_where_a_bootstrap_says_nothing():
+    one = np.array([[1.0, 0.0, 1.0, 1.0, np.nan]])
+    every, none = np.ones((3, 5)), np.zeros((3, 5))
+    mixed = np.array([[1.0, 0, 1, 1, 0]] * 3)
+    low, high = stats.rate_intervals([one, every, none, mixed])
+    for k, (successes, trials) in enumerate([(3, 4), (5, 5), (0, 5)]):
+        assert (low[k], high[k]) == stats.wilson(successes, trials)
+    assert (low[3:], high[3:]) == stats.bootstrap_intervals([mixed])
+
+
+def test_difference_intervals_of_differences_that_are_all_equal():
+    unseen = float(stats.wilson(0, 8)[1])
+    low, high = stats.difference_intervals([np.zeros((2, 8)), np.ones((2, 8)), -np.ones((1, 8))])
+    np.testing.assert_allclose(low, [-unseen, 1 - unseen, -1])
+    np.testing.assert_allclose(high, [unseen, 1, unseen - 1])
+
+
+def test_differences_are_paired_by_seed_and_scenario():
+    a, b = np.array([[1.0, 0.0], [1.0, 1.0], [0.0, 0.0]]), np.array([[0.0, 0.0], [1.0, np.nan]])
+    seeds = np.array([0, 1, 4]), np.array([1, 4])
+    np.testing.assert_array_equal(stats.paired_differences(a, seeds[0], b, seeds[1]), [[1, 1], [-1, np.nan]])
+    np.testing.assert_array_equal(stats.paired_differences(b, seeds[1], a, seeds[0]), [[-1, -1], [1, np.nan]])
+    alone = stats.paired_differences(a, seeds[0], b[:1], np.array([9]))
+    np.testing.assert_array_equal(alone, [[1, 0], [1, 1], [0, 0]])
+    assert stats.paired_differences(a, seeds[0], b, np.array([2, 3])).shape == (0, 2)
+
+
+def test_mcnemar_by_hand_and_by_scipy():
+    assert stats.mcnemar(1, 6) == pytest.approx(2 * (1 + 7) / 2**7)
+    assert stats.mcnemar(0, 5) == stats.mcnemar(5, 0) == pytest.approx(2 / 2**5)
+    assert stats.mcnemar([0, 4], [0, 4]).tolist() == [1, 1]
+    pairs = [(a, b) for a in (0, 1, 3, 17, 250) for b in (1, 2, 18, 300, 2_500)]
+    expected = [binomtest(a, a + b).pvalue for a, b in pairs]
+    np.testing.assert_allclose(stats.mcnemar(*zip(*pairs, strict=True)), expected, rtol=1e-9)
+
+
+def test_holm_by_hand():
+    # 4 · 0.005, 3 · 0.01, 2 · 0.03, and 1 · 0.04, which must not fall below the one before.
+    np.testing.assert_allclose(stats.holm([0.01, 0.04, 0.03, 0.005]), [0.03, 0.06, 0.06, 0.02])
+    np.testing.assert_allclose(stats.holm([0.6, 0.5, 0.5]), [1, 1, 1])
+    assert stats.holm([0.2]).tolist() == [0.2] and stats.holm([]).shape == (0,)
+
+
+@pytest.mark.parametrize("n", range(1, 14))
+def test_the_iqm_is_rliable_s(n):
+    values = np.random.default_rng(n).normal(size=n)
+    assert stats.iqm(values) == pytest.approx(trim_mean(values, 0.25))
+
+
+def test_the_iqm_by_hand():
+    assert stats.iqm([[-100, 2], [4, 1_000]]) == 3

@@ -1,0 +1,197 @@
+"""The command line of :mod:`benchmarks.tune`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from benchmarks.run import parse_settings
+from rise_agents import AGENTS
+from rise_agents.cli import Parser, prepare_folder
+
+if TYPE_CHECKING:
+    from benchmarks.tune.search import Search
+
+_EXAMPLES = """\
+examples:
+  python -m benchmarks.tune --agents rise pcbc cppo --envs RISE-GroundVehicle-v0
+  python -m benchmarks.tune --agents rise pcbc --demos runs/paper/demonstrations/RISE-GroundVehicle-v0-05b560dddb
+  python -m benchmarks.tune --envs RISE-SafePanda-v0 --eval-env RISE-SafePandaKinematic-v0 --write tuned.toml
+
+A search that was stopped continues where it was: give the same command again.
+"""
+
+
+def parser() -> Parser:
+    """The command line."""
+    p = Parser(
+        prog="python -m benchmarks.tune",
+        description="Search settings, with the same budget for each agent, on validation scenarios.",
+        epilog=_EXAMPLES,
+    )
+    p.add_argument(
+        "--agents",
+        nargs="+",
+        default=["rise", "pcbc", "cppo"],
+        metavar="NAME",
+        help="agents to search settings of (default: rise pcbc cppo)",
+    )
+    p.add_argument(
+        "--envs", nargs="+", metavar="ID", help="environments (default: all whose results are reported)"
+    )
+    p.add_argument(
+        "--trials",
+        type=int,
+        default=16,
+        metavar="N",
+        help="settings in the first round, the defaults among them (default: 16)",
+    )
+    p.add_argument(
+        "--seeds", type=int, default=3, metavar="N", help="training seeds of the second round (default: 3)"
+    )
+    p.add_argument(
+        "--scenarios", type=int, default=400, metavar="N", help="validation scenarios (default: 400)"
+    )
+    p.add_argument(
+        "--clean-loss",
+        type=float,
+        default=1.0,
+        metavar="P",
+        help="points that the chosen settings may lose on true readings (default: 1)",
+    )
+    p.add_argument(
+        "--demos",
+        nargs="+",
+        type=Path,
+        default=[],
+        metavar="DIR",
+        help="recorded demonstrations, one set per environment (default: record them)",
+    )
+    p.add_argument(
+        "--episodes",
+        type=int,
+        default=2_000,
+        metavar="N",
+        help="episodes to record where no set is given (default: 2000)",
+    )
+    p.add_argument("--expert", default="mixture", metavar="NAME", help="who demonstrates (default: mixture)")
+    p.add_argument(
+        "--transitions",
+        type=int,
+        default=10_000,
+        metavar="N",
+        help="transitions to learn from, others for each training seed; 0: all (default: 10000)",
+    )
+    p.add_argument(
+        "--eval-env", default="", metavar="ID", help="judge the agents of what this stands in for here"
+    )
+    p.add_argument(
+        "--set",
+        nargs="+",
+        default=[],
+        metavar="AGENT.FIELD=VALUE",
+        dest="settings",
+        help="settings that are not searched but the same in all trials, for instance rise.average=4",
+    )
+    p.add_argument("--workers", type=int, metavar="N", help="processes (default: one per core)")
+    p.add_argument(
+        "--checkpoint-every",
+        type=float,
+        default=15.0,
+        metavar="S",
+        help="seconds between two checkpoints of a training, from which it goes on if interrupted (default: 15)",
+    )
+    p.add_argument(
+        "--write", type=Path, metavar="FILE", help="settings file that the chosen settings go into, too"
+    )
+    p.add_argument(
+        "--out", type=Path, default=Path("runs/tune"), metavar="DIR", help="folder (default: runs/tune)"
+    )
+    return p
+
+
+def search_of(a: argparse.Namespace) -> Search:
+    """The search that the arguments ask for; raises ``ValueError`` for what can be known to fail before any work."""
+    from benchmarks.protocol import make_plan
+    from benchmarks.tune import settings_file
+    from benchmarks.tune.ranking import MODEL
+    from benchmarks.tune.search import Search
+    from rise_agents.agent import nearest
+    from rise_envs import ENVS, STAND_INS
+
+    if a.workers is not None and a.workers < 1:
+        raise ValueError(f"--workers must be at least 1, got {a.workers}")
+    if not a.checkpoint_every >= 0:
+        raise ValueError(f"--checkpoint-every must not be negative, got {a.checkpoint_every}")
+    for name in a.agents:
+        if name not in AGENTS:
+            raise ValueError(f"unknown agent {name!r}: {nearest(name, AGENTS)}")
+    plan = make_plan(
+        "quick",
+        parse_settings(a.settings),
+        agents=tuple(dict.fromkeys(a.agents)),
+        envs=tuple(dict.fromkeys(a.envs or [env for env in ENVS if env not in STAND_INS])),
+        demos=a.episodes,
+        episodes=a.scenarios,
+        noise_models=(MODEL,),
+        seeds=a.seeds,
+        expert=a.expert,
+    )
+    search = Search(plan, a.trials, a.transitions, a.clean_loss / 100, a.eval_env, tuple(a.demos))
+    for agent, env in search.pairs():
+        search.study(agent, env)
+    if a.write is not None:
+        settings_file.read(a.write)
+    return search
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Search settings; returns the exit code: 0 done, 1 something failed, 2 bad arguments, 130 interrupted."""
+    started = time.perf_counter()
+    try:
+        a = parser().parse_args(argv)
+        warnings.simplefilter("ignore", DeprecationWarning)  # of libraries; their users cannot act on them
+        search = search_of(a)
+        from benchmarks.tune.search import (
+            How,
+            execute,
+            given_sets,
+        )  # only now: it imports all that work needs
+
+        sets = given_sets(search)
+        prepare_folder(a.out)
+    except ValueError as error:
+        print(f"benchmarks.tune: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+    command = ("python", "-m", "benchmarks.tune", *(sys.argv[1:] if argv is None else argv))
+    try:
+        from rise_agents.files import sole_user
+        from rise_agents.workers import available_cores
+
+        how = How(a.workers or available_cores(), a.checkpoint_every, command, a.write)
+        with sole_user(a.out):
+            failures = execute(search, sets, a.out, how)
+    except KeyboardInterrupt:
+        print(
+            "\nbenchmarks.tune: interrupted; what is finished is kept, run the command again to go on",
+            file=sys.stderr,
+        )
+        return 130
+    except (OSError, ValueError) as error:
+        print(f"benchmarks.tune: {error}", file=sys.stderr)
+        return 1
+    for failure in failures:
+        print(f"benchmarks.tune: failed: {failure.job.name}: {failure.reason}", file=sys.stderr)
+    print(f"{'Finished' if not failures else 'Stopped'} after {time.perf_counter() - started:.0f} s: {a.out}")
+    return 1 if failures else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,67 @@
+"""Which settings are better: the one rule, the same for all agents.
+
+The score is the mean of Safety and Reach Rate on noisy readings, among settings that lose next to nothing on true ones:
+robustness must not be bought with what a policy does when it sees well.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+CLEAN, NOISY = 0.0, 1.0  # the noise levels that settings are judged at
+MODEL = "step"
+KEPT = 4  # one in so many settings goes on to the second round
+_ROUNDING = 1e-9  # rates are quotients: 0.99 - 0.98 is not 0.01
+
+
+class Rates(NamedTuple):
+    """Safety and Reach Rate on true readings and at noise level 1, all in [0, 1]."""
+
+    clean_safety: float
+    clean_reach: float
+    safety: float
+    reach: float
+
+    @property
+    def clean(self) -> float:
+        """Mean of both rates on true readings."""
+        return (self.clean_safety + self.clean_reach) / 2
+
+    @property
+    def score(self) -> float:
+        """Mean of both rates at noise level 1."""
+        return (self.safety + self.reach) / 2
+
+
+def mean(rates: Sequence[Rates]) -> Rates:
+    """The mean of each rate over training seeds."""
+    return Rates(*(math.fsum(column) / len(rates) for column in zip(*rates, strict=True)))
+
+
+def ranked(rates: Mapping[int, Rates], clean_loss: float) -> list[int]:
+    """Trials, best first.
+
+    Those come first whose rates on true readings are both at most ``clean_loss`` below the rates of the trial that is
+    best there (by their mean); among them the higher score is better. The others follow, by their score, too. Of equal
+    trials the one with the lower number is better: trial 0 has the agent's defaults.
+
+    Args:
+        rates: of each trial of one round, by its number.
+        clean_loss: in [0, 1].
+    """
+    if not rates:
+        return []
+    best = rates[min(rates, key=lambda n: (-rates[n].clean, -rates[n].score, n))]
+
+    def loses(rate: Rates) -> bool:
+        loss = max(best.clean_safety - rate.clean_safety, best.clean_reach - rate.clean_reach)
+        return loss > clean_loss + _ROUNDING
+
+    return sorted(rates, key=lambda n: (loses(rates[n]), -rates[n].score, n))
+
+
+def finalists(rates: Mapping[int, Rates], clean_loss: float, trials: int) -> list[int]:
+    """The best quarter of ``trials``, rounded up; fewer only if fewer were measured."""
+    return ranked(rates, clean_loss)[: -(-trials // KEPT)]

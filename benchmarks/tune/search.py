@@ -1,0 +1,193 @@
+"""A search from start to end: demonstrations, two rounds of trials, tables."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from benchmarks.display import Display
+from benchmarks.executors import Failure, run_jobs
+from benchmarks.jobs import Job, demonstrations_folder, recording_jobs, tidy
+from benchmarks.protocol import Plan, imitates
+from benchmarks.tune import report
+from benchmarks.tune.ranking import Rates, finalists, mean, ranked
+from benchmarks.tune.studies import Study, condition, drawn_trials
+from rise_agents import demonstrations
+from rise_agents.files import sweep
+from rise_envs import STAND_INS
+
+
+@dataclass(frozen=True)
+class Search:
+    """What is searched, complete: the same search finds the same settings.
+
+    Attributes:
+        plan: agents, environments, fixed settings; ``demos`` episodes of its ``expert`` are recorded, ``episodes``
+            validation scenarios judge, ``seeds`` training seeds decide.
+        trials: settings in the first round of each study.
+        transitions: that each training seed learns from; 0: from all.
+        clean_loss: what the chosen settings may lose on true readings, in [0, 1].
+        eval_env: a stand-in that agents of what it models are judged in; empty: none.
+        sets: folders of recorded demonstrations.
+    """
+
+    plan: Plan
+    trials: int
+    transitions: int
+    clean_loss: float
+    eval_env: str = ""
+    sets: tuple[Path, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name, value, low in (("trials", self.trials, 1), ("transitions", self.transitions, 0)):
+            if value < low:
+                raise ValueError(f"{name} must be at least {low}, got {value}")
+        if not 0 <= self.clean_loss <= 1:
+            raise ValueError(f"the clean loss must lie from 0 to 100 points, got {100 * self.clean_loss:g}")
+        if self.eval_env and STAND_INS.get(self.eval_env) not in self.plan.envs:
+            known = ", ".join(f"{name} for {env}" for name, env in STAND_INS.items())
+            raise ValueError(f"{self.eval_env!r} stands in for no environment of this search; known: {known}")
+
+    def study(self, agent: str, env: str, source: tuple[Path, str] | None = None) -> Study:
+        """An agent in an environment, learning from the set in a folder with a digest.
+
+        Raises:
+            ValueError: the agent declares no space, or its settings make no sense.
+        """
+        fixed = {**condition(agent, self.transitions), **self.plan.config(agent, env)}
+        try:
+            trials = drawn_trials(agent, env, self.trials, fixed)
+        except ValueError as error:
+            raise ValueError(f"settings of {agent}: {error}") from None
+        judged = self.eval_env if STAND_INS.get(self.eval_env) == env else env
+        data, digest = source if source is not None and imitates(agent) else (None, "")
+        return Study(agent, env, judged, self.plan.episodes, trials, data, digest)
+
+    def pairs(self) -> list[tuple[str, str]]:
+        """(agent, environment) of each study."""
+        return [(agent, env) for env in self.plan.envs for agent in self.plan.agents]
+
+
+@dataclass(frozen=True)
+class How:
+    """How a search is carried out; none of this changes what it finds.
+
+    Attributes:
+        workers: processes.
+        every: seconds between two checkpoints of a training.
+        command: how it was started, for the comments of settings files.
+        write: a settings file that the chosen settings go into, beside the one in the folder.
+    """
+
+    workers: int
+    every: float
+    command: tuple[str, ...]
+    write: Path | None = None
+
+
+def given_sets(search: Search) -> dict[str, tuple[Path, str]]:
+    """Folder and digest of the sets that are there, by environment.
+
+    Raises:
+        ValueError: one is damaged, too small, of an environment that is not searched, or the second of its kind.
+    """
+    found: dict[str, tuple[Path, str]] = {}
+    for folder in search.sets:
+        loaded = _checked_set(folder, search)
+        if loaded.env_id not in search.plan.envs or loaded.env_id in found:
+            why = "a second set" if loaded.env_id in found else "a set of an environment that is not searched"
+            raise ValueError(f"{folder} holds {why}: {loaded.env_id}")
+        found[loaded.env_id] = folder, loaded.digest()
+    return found
+
+
+def _checked_set(folder: Path, search: Search) -> demonstrations.Demonstrations:
+    loaded = demonstrations.load(folder)
+    needed, there = search.transitions * search.plan.seeds, len(loaded.actions)
+    if there < needed:
+        raise ValueError(
+            f"{folder} holds {there:,} transitions, but {search.plan.seeds} training seeds need {needed:,}: "
+            "record more episodes, or use fewer transitions or seeds"
+        )
+    return loaded
+
+
+def execute(search: Search, sets: Mapping[str, tuple[Path, str]], out: Path, how: How) -> list[Failure]:
+    """Do what the search asks for and is not done yet, in the folder ``out``; returns what failed.
+
+    Raises:
+        ValueError: recorded demonstrations do not suffice, or a file is not what it should be.
+    """
+    for folder in [out, *(path for path in out.rglob("*") if path.is_dir())]:
+        sweep(folder)
+    tidy(out)
+    sources, failures = _recorded(search, sets, out, how)
+    studies = [
+        search.study(agent, env, sources.get(env))
+        for agent, env in search.pairs()
+        if env in sources or not imitates(agent)
+    ]
+    first = {study: range(len(study.trials)) for study in studies}
+    failures += _run(_jobs(first, [0], out, how.every), how, "first round: train, judge")
+    rates = {study: _measured(study, first[study], [0], out) for study in studies}
+    second = {study: finalists(rates[study], search.clean_loss, len(study.trials)) for study in studies}
+    seeds = range(search.plan.seeds)
+    failures += _run(_jobs(second, seeds[1:], out, how.every), how, "second round: train, judge")
+
+    found = []
+    for study in studies:
+        final = _measured(study, second[study], seeds, out)
+        if final:
+            chosen = ranked(final, search.clean_loss)[0]
+            trials = tuple(second[study])
+            numbers = (chosen, final[chosen], rates[study].get(0), trials, len(seeds), len(rates[study]))
+            found.append(report.Found(study, *numbers))
+    report.write_trials(out / "trials.csv", studies, len(seeds), out)
+    tables = report.tables(found, how.command, search.clean_loss)
+    for path in [out / "tuned.toml", *([how.write] if how.write else [])]:
+        report.write_settings(path, tables)
+    print("\n".join(tables.values()))
+    return failures
+
+
+def _recorded(
+    search: Search, sets: Mapping[str, tuple[Path, str]], out: Path, how: How
+) -> tuple[dict[str, tuple[Path, str]], list[Failure]]:
+    """Folder and digest of every environment's demonstrations, after recording those that are not there."""
+    jobs = [
+        job
+        for job in recording_jobs(search.plan, out)
+        if not any(demonstrations_folder(search.plan, env, out) in job.output.parents for env in sets)
+    ]
+    failures = _run(jobs, how, "record") if jobs else []
+    sources = dict(sets)
+    for env in search.plan.envs:
+        folder = demonstrations_folder(search.plan, env, out)
+        if env not in sources and (folder / demonstrations.DATA).exists():
+            sources[env] = folder, _checked_set(folder, search).digest()
+    return sources, failures
+
+
+def _jobs(trials: Mapping[Study, Iterable[int]], seeds: Iterable[int], out: Path, every: float) -> list[Job]:
+    """Train and judge; settings that two trials share are trained once."""
+    jobs = [
+        job
+        for seed in seeds
+        for study, numbers in trials.items()
+        for trial in numbers
+        for job in study.jobs(trial, seed, out, every)
+    ]
+    return list({job.output: job for job in jobs}.values())
+
+
+def _run(jobs: Sequence[Job], how: How, kinds: str) -> list[Failure]:
+    with Display() as display:
+        display.plan(jobs, kinds)
+        return run_jobs(jobs, how.workers, display.watch, display.say)
+
+
+def _measured(study: Study, trials: Iterable[int], seeds: Iterable[int], out: Path) -> dict[int, Rates]:
+    """Mean rates of the trials that were measured with all the seeds."""
+    every = {trial: [study.rates(trial, seed, out) for seed in seeds] for trial in trials}
+    return {trial: mean([r for r in rates if r]) for trial, rates in every.items() if all(rates)}
