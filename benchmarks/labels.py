@@ -13,7 +13,14 @@ if TYPE_CHECKING:
 
 REFERENCES = ("expert", "random")  # rows to compare with, not agents under test
 TRUE = "true"  # ``ROW+true``: the row on true readings, at whatever level the others meet noise
-_AGENTS = {"rise": "RISE", "pcbc": "PC-BC", "cppo": "C-PPO", "expert": "Expert", "random": "Random"}
+_AGENTS = {
+    "rise": "RISE",
+    "pcbc": "PC-BC",
+    "cppo": "C-PPO",
+    "rise-belief": "RISE-belief",
+    "expert": "Expert",
+    "random": "Random",
+}
 _ENVS = {  # others are read off their id
     "RISE-SafePanda-v0": "Franka Panda",
     "RISE-SafePandaKinematic-v0": "Franka Panda, kinematic model",

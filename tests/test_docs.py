@@ -25,6 +25,7 @@ from benchmarks.tables import ComparisonRow, SummaryRow
 from benchmarks.tune.__main__ import parser as tune_parser
 from rise_agents import AGENTS, agent_class, readings
 from rise_agents.agent import make_config
+from rise_agents.belief.agent import Config as BeliefConfig
 from rise_agents.cloning import CloningConfig
 from rise_agents.experts import EXPERTS
 from rise_agents.filters import FILTERS
@@ -248,6 +249,15 @@ def test_the_table_of_settings_has_every_field_and_its_default():
     for name, default, of, _ in rows:
         for kind, known in ((RiseConfig, "rise"), (PCBCConfig, "pcbc")):
             assert known not in of.split(", ") or default == str(getattr(kind(), name))
+
+
+def test_the_table_of_the_belief_s_settings_is_complete():
+    rows = table("agents.md", "setting of its own", "default")
+    shared = {field.name for field in fields(CloningConfig)}
+    own = [
+        (f.name, str(getattr(BeliefConfig(), f.name))) for f in fields(BeliefConfig) if f.name not in shared
+    ]
+    assert [(row[0], row[1]) for row in rows] == own
 
 
 def test_the_table_of_frames_has_the_sizes_of_their_inputs():

@@ -40,6 +40,7 @@ from rise_agents.files import StrPath
 from rise_agents.forward import Forward, layers_of, standardised
 from rise_agents.readings import checked_batch
 from rise_agents.resume import Resume
+from rise_agents.search import EVERYWHERE, Choice, Space
 
 Array = NDArray[np.float64]
 
@@ -93,6 +94,13 @@ class RiseBelief:
     PRESETS: ClassVar[dict[str, dict[str, Any]]] = {
         "RISE-GroundVehicle-v0": {"margin": 2.0},
         "RISE-SafePanda-v0": {"margin": 0.5, "hidden": (256, 256), "frame": "body"},
+    }
+    SEARCH: ClassVar[dict[str, Space]] = {
+        EVERYWHERE: {
+            **cloning.SEARCH,
+            "margin": Choice((0.25, 0.5, 1.0, 1.5, 2.0, 2.5)),
+            "belief_updates": Choice((3_000, 6_000, 12_000)),
+        }
     }
     ACTING: ClassVar[frozenset[str]] = frozenset({"margin", "shield"})
     learns_from = "demonstrations"
