@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from rise_agents.filters import FILTERS, filter_class
+from rise_envs.noise import parts_of
 
 if TYPE_CHECKING:
     from benchmarks.tables import SummaryRow
@@ -27,12 +28,14 @@ _ENVS = {  # others are read off their id
 }
 _NOISE = {
     "step": "fresh noise at every step",
+    "outlier": "fresh noise with outliers",
     "episode": "one constant error per episode",
     "drift": "a drifting error",
     "dropout": "lost readings",
     "delay": "delayed readings",
     "quantise": "rounded readings",
 }
+_GROUPS = {"position": "positions", "velocity": "velocities", "radius": "radii"}
 
 
 def split_row(row: str) -> tuple[str, str]:
@@ -75,9 +78,13 @@ def env_label(env: str) -> str:
 
 
 def noise_label(model: str) -> str:
-    """A noise model (``rise_envs.noise``) in a few words: ``step+delay:2`` is "… + delayed readings (2)"."""
-    parts = [part.partition(":") for part in model.split("+")]
-    return " + ".join(_NOISE.get(name, name) + f" ({value})" * bool(value) for name, _, value in parts)
+    """A noise model (``rise_envs.noise``) in a few words: ``delay:2@position`` is "delayed readings (2), …"."""
+    return " + ".join(
+        _NOISE.get(name, name)
+        + f" ({':'.join(values)})" * bool(values)
+        + f", {_GROUPS.get(group, group)} only" * bool(group)
+        for name, values, group in parts_of(model)
+    )
 
 
 def condition_label(model: str, level: float) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -34,6 +35,7 @@ _MARKERS = "osD^vPX*<>"
 INK, FAINT, GRID = "#222222", "#6A6A6A", "#E6E6E6"
 _WIDTH = 10.0  # inches
 _LEGEND_LETTERS = 90  # that fit into its width
+_NOTE_LETTERS, _NOTE_HEIGHT = 117, 0.2  # that fit beside each other; inches from line to line
 
 Rate = tuple[float, float, float]  # rate, lower end, upper end
 
@@ -119,7 +121,7 @@ def noise_curve(summary: Sequence[SummaryRow], noise_model: str | None = None) -
             axis.set_xticks(levels, [f"{level:g}" for level in levels])
             axis.set(ylim=(bottom, 102.5), xlabel="noise level", ylabel=metric.meaning)
     handles = [Line2D([], [], label=agent_label(agent), **styles[agent]) for agent in agents]
-    top = 1 - 0.66 / figure.get_figheight()
+    top = 1 - (0.66 + _NOTE_HEIGHT * (len(_lines(notes)) - 1)) / figure.get_figheight()
     figure.legend(
         handles=handles,
         loc="upper left",
@@ -174,17 +176,24 @@ def _of_model(summary: Sequence[SummaryRow], noise_model: str | None) -> list[Su
     return own + [row for key, row in clean.items() if key in missing]
 
 
+def _lines(notes: Sequence[str]) -> list[str]:
+    """Notes beside each other, in as many lines as they need."""
+    return [line.strip(" ·") for line in textwrap.wrap("  ·  ".join(notes), _NOTE_LETTERS)]
+
+
 def _panels(
     envs: Sequence[str], panel_height: float, title: str, notes: Sequence[str], legend_height: float = 0.0
 ) -> tuple[Figure, list[list[Axes]]]:
     """A figure with a header and empty panels, a row per env and a column per metric; heights in inches."""
-    header = 0.74 + legend_height
+    header = 0.74 + _NOTE_HEIGHT * (len(_lines(notes)) - 1) + legend_height
     height = header + panel_height * len(envs)
     below = (0.005, 0.01, 0.99, 0.99 - header / height)
     layout = ConstrainedLayoutEngine(rect=below, h_pad=0.08, w_pad=0.08)
     figure = Figure(figsize=(_WIDTH, height), layout=layout)
     figure.text(0.015, 1 - 0.14 / height, title, va="top", size=14.5, weight="bold", color=INK)
-    figure.text(0.015, 1 - 0.45 / height, "  ·  ".join(notes), va="top", size=10.5, color=FAINT)
+    for place, line in enumerate(_lines(notes)):
+        below_title = 0.45 + _NOTE_HEIGHT * place
+        figure.text(0.015, 1 - below_title / height, line, va="top", size=10.5, color=FAINT)
     axes = figure.subplots(len(envs), len(METRICS), squeeze=False).tolist()
     for env, pair in zip(envs, axes, strict=True):
         for axis, metric in zip(pair, METRICS, strict=True):

@@ -7,6 +7,7 @@ same scenarios with the same noise draws, so results pair up; test seeds lie in 
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -24,6 +25,7 @@ from rise_agents.rollout import is_batched_env
 from rise_agents.seeds import RUNS, episode_seeds
 from rise_envs import ENVS
 from rise_envs.noise import make_noise
+from rise_envs.task import task_of
 
 
 @dataclass(frozen=True)
@@ -142,8 +144,8 @@ class Plan:
         for level in self.noise_levels:
             if not 0 <= level < float("inf"):
                 raise ValueError(f"noise levels must be finite and not negative, got {level}")
-        for model in self.noise_models:
-            make_noise(model)
+        for model, env in itertools.product(self.noise_models, self.envs):
+            make_noise(model, groups=task_of(env).noise_channels)
         if self.pretrained and self.seeds != 1:
             raise ValueError(
                 "agents that come with the package are trained: there is one training seed of each"

@@ -95,7 +95,8 @@ def parser() -> Parser:
         nargs="+",
         default=["step"],
         metavar="MODEL",
-        help="step, episode, drift, dropout, delay, quantise, or sums as in step+episode (default: step)",
+        help="step, outlier, episode, drift, dropout, delay, quantise, sums as in step+episode, or on some channels"
+        " only, as in step@position+episode@radius (default: step)",
     )
     p.add_argument("--demos", type=int, metavar="N", help="expert episodes to learn from, per environment")
     p.add_argument("--expert", default="mixture", metavar="NAME", help="who demonstrates (default: mixture)")

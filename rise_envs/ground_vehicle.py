@@ -100,6 +100,11 @@ class VehicleTask(goals.GoalAPI):
         """Standard deviation of the readings at noise level 1, per channel."""
         return {"obstacle": np.array(self.task(self.n_obstacles, self.params).noise_scale)}
 
+    @property
+    def noise_channels(self) -> dict[str, dict[str, tuple[int, ...]]]:
+        """The channels of each group that noise can be limited to."""
+        return {"obstacle": self.task(self.n_obstacles, self.params).noise_channels}
+
 
 class GroundVehicleEnv(VehicleTask, gym.Env):
     """A ground vehicle reaches a goal past a moving disc whose motion cannot be predicted.

@@ -3,12 +3,15 @@
 A noise model maps readings (B, C) to noisy readings (B, C), with C reading channels and B episodes side by
 side. All draws come from ``rise_envs.streams``: they are a function of the episode's noise key and the step,
 so an episode gets the same noise alone, in any batch and in any process. In text, a model is written
-``name:parameter``, and several are joined by a plus sign: ``step+dropout:0.3+delay:2``.
+``name:parameter``, and several are joined by a plus sign: ``step+dropout:0.3+delay:2``. ``name:parameter@group``
+keeps it in one group of channels, of those that the environment names: ``step@velocity+episode@position``.
 
 ========================= ================================================== =============================
 name:parameter (default)  effect                                             parameter at noise level λ
 ========================= ================================================== =============================
 ``step:deviation`` (1)    adds N(0, (deviation·scale)²), fresh in each step  deviation · λ
+``outlier:p`` (0.05)      as ``step``, but with probability p the errors of   deviation (1) · λ
+                          the whole reading are 10 times larger
 ``episode:deviation`` (1) adds one draw of that law, kept for the episode    deviation · λ
 ``drift:rate`` (0.1)      adds a random walk, deviation rate·scale·√t at t   rate · λ
 ``dropout:p`` (0.2)       with probability p the whole reading is lost and   1 − (1 − p)^λ
@@ -32,6 +35,7 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -43,8 +47,11 @@ from rise_envs.noise_models import (
     Drift,
     Dropout,
     EpisodeBias,
+    Groups,
     Keys,
     NoiseModel,
+    Only,
+    Outlier,
     Quantise,
     StepNoise,
     require,
@@ -52,6 +59,7 @@ from rise_envs.noise_models import (
 
 NOISE_MODELS: dict[str, Callable[..., NoiseModel]] = {
     "step": StepNoise,
+    "outlier": Outlier,
     "episode": EpisodeBias,
     "drift": Drift,
     "dropout": Dropout,
@@ -60,30 +68,71 @@ NOISE_MODELS: dict[str, Callable[..., NoiseModel]] = {
 }
 
 
-def make_noise(noise: str | NoiseModel, level: float = 1.0) -> NoiseModel:
+class Part(NamedTuple):
+    """A model as it is written.
+
+    Attributes:
+        name: what stands first.
+        values: what follows each colon.
+        group: what follows ``@``; empty: all channels.
+    """
+
+    name: str
+    values: tuple[str, ...]
+    group: str
+
+
+def parts_of(text: str) -> list[Part]:
+    """The parts of a text such as ``step+dropout:0.3@position``, whether or not there are such models.
+
+    Raises:
+        ValueError: nothing, or a second ``@``, follows an ``@``.
+    """
+    parts = []
+    # A plus sign before a digit belongs to a number, as in 1e+3.
+    for part in re.split(r"\+(?!\d)", text):
+        model, at, group = (piece.strip() for piece in part.partition("@"))
+        if at and (not group or "@" in group):
+            raise ValueError(f"noise model {part.strip()!r}: after '@' stands one group of channels")
+        name, *values = model.split(":")
+        parts.append(Part(name, tuple(values), group))
+    return parts
+
+
+def make_noise(noise: str | NoiseModel, level: float = 1.0, groups: Groups | None = None) -> NoiseModel:
     """The model that a text such as ``step+dropout:0.3+delay:2`` (or a model) stands for, at a noise level.
+
+    Args:
+        noise: a model or its text.
+        level: multiplies it.
+        groups: the channels of each group that can stand after an ``@``; None: they are not known yet, and the model
+            needs :meth:`~rise_envs.noise_models.NoiseModel.bound` before it is used.
 
     >>> make_noise("episode + delay:2", level=0.5)
     Compose(parts=(EpisodeBias(deviation=0.5), Delay(steps=1)))
+    >>> make_noise("step@radius", groups={"position": [0, 1], "radius": [2]})
+    Only(model=StepNoise(deviation=1.0), group='radius', channels=(2,))
 
     Raises:
-        ValueError: an unknown name (the nearest known one is suggested), a parameter that is no number or out
-            of range, a level that is negative or not finite.
+        ValueError: an unknown name (the nearest known one is suggested) of a model or of a group, a parameter that is
+            no number or out of range, a level that is negative or not finite.
     """
     require("noise_level", level)
     if isinstance(noise, str):
-        # A plus sign before a digit belongs to a number, as in 1e+3.
-        models = [_make_part(part.strip(), noise) for part in re.split(r"\+(?!\d)", noise)]
+        models = [_make_part(part, noise) for part in parts_of(noise)]
         noise = models[0] if len(models) == 1 else Compose(tuple(models))
     if not isinstance(noise, NoiseModel):
         raise ValueError(f"noise must be a NoiseModel or a text such as 'step+dropout:0.3', got {noise!r}")
+    if groups is not None:
+        noise = noise.bound(groups)
     if level == 0:
         return Compose(())  # rather than a model of amplitude 0: this keeps even the sign of −0.0
     return noise if level == 1 else noise.at(level)
 
 
-def _make_part(text: str, whole: str) -> NoiseModel:
-    name, *values = text.split(":")
+def _make_part(part: Part, whole: str) -> NoiseModel:
+    name, values, group = part
+    text = ":".join((name, *values))
     if name not in NOISE_MODELS:
         near = difflib.get_close_matches(name, NOISE_MODELS, n=1)
         hint = f"; did you mean {near[0]!r}?" if near else ""
@@ -93,12 +142,15 @@ def _make_part(text: str, whole: str) -> NoiseModel:
     except ValueError:
         raise ValueError(f"noise model {text!r}: what follows a ':' must be a number") from None
     try:
-        return NOISE_MODELS[name](*(int(n) if n.is_integer() else n for n in numbers))
+        model = NOISE_MODELS[name](*(int(n) if n.is_integer() else n for n in numbers))
     except TypeError:
         raise ValueError(f"noise model {text!r}: too many parameters") from None
+    return Only(model, group) if group else model
 
 
-def corrupt(noise: str | NoiseModel, readings: Array, scale: ArrayLike, keys: Keys) -> Array:
+def corrupt(
+    noise: str | NoiseModel, readings: Array, scale: ArrayLike, keys: Keys, groups: Groups | None = None
+) -> Array:
     """Recorded readings (B, T, C) with noise, as the wrappers hand them out for the same keys.
 
     Args:
@@ -106,11 +158,12 @@ def corrupt(noise: str | NoiseModel, readings: Array, scale: ArrayLike, keys: Ke
         readings: clean readings of B episodes in T steps, the first read at the reset.
         scale: unit of each channel, (C,) or a scalar.
         keys: noise key of each episode, (B,).
+        groups: the channels of each group that can stand after an ``@``, as in ``Task.noise_channels``.
 
     Returns:
         Noisy readings, (B, T, C).
     """
-    model = make_noise(noise)
+    model = make_noise(noise, groups=groups)
     n_episodes, n_steps, channels = readings.shape
     unit = np.broadcast_to(np.asarray(scale, dtype=np.float64), channels)
     state = model.reset(keys, channels)

@@ -17,6 +17,9 @@ from numpy.typing import ArrayLike
 from rise_envs.noise_models import Array
 
 Scale = float | ArrayLike | Mapping[str, float | ArrayLike]
+Given = (
+    Mapping[str, ArrayLike] | Mapping[str, Mapping[str, ArrayLike]]
+)  # groups of channels, of a Dict by its keys
 
 _FLOAT64 = np.dtype(np.float64)
 _FLOATS = (np.float16, np.float32, np.float64)
@@ -151,6 +154,45 @@ class Channels:
         else:
             per_key = {name: given for name in names}
         return np.concatenate([_scale(per_key[n], box, n) for n, box in zip(names, self.boxes, strict=True)])
+
+    def groups(self, given: Given | None, published: Any) -> dict[str, tuple[int, ...]]:
+        """The columns of each named group of channels, in the flat row.
+
+        Args:
+            given: ``noise_channels`` of the wrapper: by group the places of its numbers in the (flattened) Box, or a
+                dict of these by key.
+            published: the same by key, as the environment says; looked at if nothing was given.
+
+        Raises:
+            ValueError: it does not name noised keys, or a place is none.
+        """
+        names = self.keys or ("observation",)
+        if given is None:
+            by_key: Any = published if isinstance(published, Mapping) else {}
+        elif self.keys is None:
+            by_key = {names[0]: given}
+        elif isinstance(given, Mapping) and set(given) <= set(names):
+            by_key = given
+        else:
+            raise ValueError(f"noise_channels must have noised keys, of {list(names)}, got {given!r}")
+        found: dict[str, tuple[int, ...]] = {}
+        for name, box, span in zip(names, self.boxes, self.spans, strict=True):
+            for group, places in _groups(by_key.get(name, {}), math.prod(box.shape), name).items():
+                found[group] = (*found.get(group, ()), *(span.start + place for place in places))
+        return found
+
+
+def _groups(given: Any, size: int, name: str) -> dict[str, list[int]]:
+    """The places of each group in a part of ``size`` numbers, checked."""
+    try:
+        found = {group: np.asarray(places) for group, places in given.items()}
+        whole = all(places.ndim == 1 and places.dtype.kind in "iu" for places in found.values())
+    except (AttributeError, ValueError):  # no dict; lists of different lengths
+        whole = False
+    if not whole or not all(((places >= 0) & (places < size)).all() for places in found.values()):
+        wanted = f"lists of whole numbers from 0 to {size - 1} by group"
+        raise ValueError(f"noise_channels of {name!r} must be {wanted}, got {given!r}")
+    return {group: places.tolist() for group, places in found.items()}
 
 
 def _array(part: Any) -> Array:

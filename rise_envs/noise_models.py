@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import difflib
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,8 +21,10 @@ Keys = Any  # uint64, int64 with torch
 Steps = Any  # int64
 State = tuple[Any, ...]  # what a model carries: a (nested) tuple of arrays, each with the batch first
 Noisy = tuple[Array, State]
+Groups = Mapping[str, Sequence[int]]  # which of the C channels belong to a group, by its name
 
 MAX_DELAY = 10_000  # steps; the readings on their way are kept in memory
+OUTLIER = 10.0  # how many times larger than the others the errors of an outlier are
 
 
 class NoiseModel(ABC):
@@ -51,6 +54,10 @@ class NoiseModel(ABC):
             step: steps since each episode's reset, (B,): 0, 1, 2, … from call to call.
             state: from :meth:`reset`, or from the call before.
         """
+
+    def bound(self, groups: Groups) -> NoiseModel:
+        """This model, which groups of channels are named in it looked up in ``groups``; most name none."""
+        return self
 
     def __add__(self, other: NoiseModel) -> Compose:
         return Compose((*_parts(self), *_parts(other)))
@@ -127,6 +134,40 @@ class StepNoise(NoiseModel):
         """The reading with a fresh error."""
         draws, state = _draws(streams.normal, step, state)
         return reading + self.deviation * scale * draws, state
+
+
+@dataclass(frozen=True)
+class Outlier(NoiseModel):
+    """Fresh Gaussian noise with heavy tails: a contaminated normal (Tukey, 1960).
+
+    Attributes:
+        probability: that the errors of a whole reading are :data:`OUTLIER` times larger, in every step.
+        deviation: standard deviation of all other readings, in units of ``scale``.
+    """
+
+    probability: float = 0.05
+    deviation: float = 1.0
+
+    def __post_init__(self) -> None:
+        require("outlier: probability", self.probability, 0.0, 1.0)
+        require("outlier: deviation", self.deviation)
+
+    def at(self, level: float) -> NoiseModel:
+        """The deviation times ``level``; as many outliers."""
+        return replace(self, deviation=self.deviation * level)
+
+    def reset(self, keys: Keys, channels: int, ahead: int = 1) -> State:
+        """The draws of errors, and those of outliers, one a step."""
+        errors, chances = streams.split(keys, 0), streams.split(keys, 1)
+        return _draw_state(errors, channels, ahead), _draw_state(chances, 1, ahead)
+
+    def __call__(self, reading: Array, scale: Array, step: Steps, state: State) -> Noisy:
+        """The reading with a fresh error, now and then a large one."""
+        errors, chances = state
+        draws, errors = _draws(streams.normal, step, errors)
+        chance, chances = _draws(streams.uniform, step, chances)
+        size = array_namespace(reading).where(chance < self.probability, OUTLIER, 1.0)
+        return reading + self.deviation * scale * size * draws, (errors, chances)
 
 
 @dataclass(frozen=True)
@@ -288,6 +329,10 @@ class Compose(NoiseModel):
         """Every part at ``level``."""
         return replace(self, parts=tuple(part.at(level) for part in self.parts))
 
+    def bound(self, groups: Groups) -> NoiseModel:
+        """Every part with its groups looked up."""
+        return replace(self, parts=tuple(part.bound(groups) for part in self.parts))
+
     def reset(self, keys: Keys, channels: int, ahead: int = 1) -> State:
         """The parts' states, each on its own stream."""
         return tuple(p.reset(streams.split(keys, i), channels, ahead) for i, p in enumerate(self.parts))
@@ -299,3 +344,62 @@ class Compose(NoiseModel):
             reading, now = part(reading, scale, step, before)
             after.append(now)
         return reading, tuple(after)
+
+
+@dataclass(frozen=True)
+class Only(NoiseModel):
+    """A model whose effect is kept in one group of channels; all others pass as they are.
+
+    Its draws are those of the model in all channels, so what a channel gets does not depend on the group.
+
+    Attributes:
+        model: what happens there.
+        group: name of the group.
+        channels: which numbers of a reading belong to it; None: not known before :meth:`bound`.
+    """
+
+    model: NoiseModel
+    group: str
+    channels: tuple[int, ...] | None = None
+
+    def at(self, level: float) -> NoiseModel:
+        """The model at ``level``, in the same channels."""
+        return replace(self, model=self.model.at(level))
+
+    def bound(self, groups: Groups) -> NoiseModel:
+        """This model with the channels of its group.
+
+        Raises:
+            ValueError: no group of this name.
+        """
+        if self.group not in groups:
+            near = difflib.get_close_matches(self.group, groups, n=1)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
+            there = (
+                f"there are: {', '.join(groups)}"
+                if groups
+                else "the environment names none: pass noise_channels"
+            )
+            raise ValueError(f"no group {self.group!r} of reading channels, {there}{hint}")
+        return replace(self, model=self.model.bound(groups), channels=tuple(groups[self.group]))
+
+    def reset(self, keys: Keys, channels: int, ahead: int = 1) -> State:
+        """Which channels are meant, (B, C); the state of the model.
+
+        Raises:
+            ValueError: which ones is not known, or some are not there.
+        """
+        if self.channels is None or not set(self.channels) <= set(range(channels)):
+            told = "are not known" if self.channels is None else f"are {self.channels} of {channels}"
+            raise ValueError(
+                f"the channels of the group {self.group!r} {told}: make_noise(…, groups=…) names them"
+            )
+        hit = _zeros(keys, channels) > 0
+        hit[:, list(self.channels)] = True
+        return hit, self.model.reset(keys, channels, ahead)
+
+    def __call__(self, reading: Array, scale: Array, step: Steps, state: State) -> Noisy:
+        """What the model gives in its channels, and the reading in all others."""
+        hit, inner = state
+        noisy, inner = self.model(reading, scale, step, inner)
+        return array_namespace(reading).where(hit, noisy, reading), (hit, inner)

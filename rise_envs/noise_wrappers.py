@@ -7,6 +7,8 @@ Both follow the same rules.
 - **How much.** ``noise_level`` × ``noise_scale``, the latter per channel: an argument (a number, an array
   that broadcasts to the Box, or a dict of these), else the dict ``env.unwrapped.noise_scale`` where the
   environment publishes one, else 1.
+- **Where.** Groups that a noise text can name (``step@position``) are the argument ``noise_channels``, else the
+  property of this name, by key and group, of the environment: see :meth:`rise_envs.noise_channels.Channels.groups`.
 - **Reproducible, and apart from the environment.** ``reset(seed=s)`` seeds the noise's own stream, further
   resets go on with it, and ``reset(options={"noise_seed": n})`` names the noise of one episode whatever the
   seed. The environment's random numbers are not touched: it moves the same with and without noise.
@@ -27,7 +29,7 @@ from gymnasium.vector.utils import batch_space
 from rise_envs import streams
 from rise_envs.episodes import check_options, check_reset, each_seed, reset_mask
 from rise_envs.noise import make_noise
-from rise_envs.noise_channels import Channels, Scale, own_copy, placed
+from rise_envs.noise_channels import Channels, Given, Scale, own_copy, placed
 from rise_envs.noise_models import Array, Keys, NoiseModel, State, Steps
 
 Rows = Any  # a mask (B,), of the library of the readings
@@ -132,6 +134,8 @@ class ObservationNoise(gym.Wrapper, RecordConstructorArgs):
         keys: which parts of a Dict observation are noised.
         noise_level: multiplies the noise; 0 is none.
         noise_scale: standard deviation of each channel at level 1.
+        noise_channels: which numbers belong to the groups that ``noise`` names: a dict of lists, or a dict of such
+            dicts by key.
 
     Raises:
         ValueError: arguments that do not fit each other, the environment or their ranges.
@@ -144,15 +148,22 @@ class ObservationNoise(gym.Wrapper, RecordConstructorArgs):
         keys: str | Sequence[str] | None = None,
         noise_level: float = 1.0,
         noise_scale: Scale | None = None,
+        noise_channels: Given | None = None,
     ) -> None:
         RecordConstructorArgs.__init__(
-            self, noise=noise, keys=keys, noise_level=noise_level, noise_scale=noise_scale
+            self,
+            noise=noise,
+            keys=keys,
+            noise_level=noise_level,
+            noise_scale=noise_scale,
+            noise_channels=noise_channels,
         )
         gym.Wrapper.__init__(self, env)
         self.channels = Channels.of(env.observation_space, keys)
         self.observation_space = self.channels.noisy_space(env.observation_space)
         scale = self.channels.scale(noise_scale, getattr(env.unwrapped, "noise_scale", None))
-        self._rows = NoiseRows(make_noise(noise, noise_level), scale, 1, ahead=64)
+        groups = self.channels.groups(noise_channels, getattr(env.unwrapped, "noise_channels", None))
+        self._rows = NoiseRows(make_noise(noise, noise_level, groups), scale, 1, ahead=64)
         named = dict(zip(self.channels.keys or (), self.channels.spans, strict=False))
         self._base: Any = env.unwrapped
         self._obstacle = named.get("obstacle") if hasattr(self._base, "perceived") else None
@@ -203,10 +214,11 @@ class VectorObservationNoise(VectorWrapper, RecordConstructorArgs):
 
     Args:
         env: any vector environment: sync, async or native.
-        noise: as in :class:`ObservationNoise`, and so are ``keys``, ``noise_level`` and ``noise_scale``.
+        noise: as in :class:`ObservationNoise`, and so are the others.
         keys: see there.
         noise_level: see there.
         noise_scale: see there.
+        noise_channels: see there.
 
     Raises:
         ValueError: as in :class:`ObservationNoise`, or no autoreset mode in the environment's metadata.
@@ -219,9 +231,15 @@ class VectorObservationNoise(VectorWrapper, RecordConstructorArgs):
         keys: str | Sequence[str] | None = None,
         noise_level: float = 1.0,
         noise_scale: Scale | None = None,
+        noise_channels: Given | None = None,
     ) -> None:
         RecordConstructorArgs.__init__(
-            self, noise=noise, keys=keys, noise_level=noise_level, noise_scale=noise_scale
+            self,
+            noise=noise,
+            keys=keys,
+            noise_level=noise_level,
+            noise_scale=noise_scale,
+            noise_channels=noise_channels,
         )
         VectorWrapper.__init__(self, env)
         try:
@@ -231,8 +249,12 @@ class VectorObservationNoise(VectorWrapper, RecordConstructorArgs):
         self.channels = Channels.of(env.single_observation_space, keys)
         self.single_observation_space = self.channels.noisy_space(env.single_observation_space)
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
-        scale = self.channels.scale(noise_scale, _published_scale(env) if noise_scale is None else None)
-        self._rows = NoiseRows(make_noise(noise, noise_level), scale, env.num_envs, ahead=1)
+        scale = self.channels.scale(
+            noise_scale, _published(env, "noise_scale") if noise_scale is None else None
+        )
+        published = _published(env, "noise_channels") if noise_channels is None else None
+        model = make_noise(noise, noise_level, self.channels.groups(noise_channels, published))
+        self._rows = NoiseRows(model, scale, env.num_envs, ahead=1)
         self._noisy: Array | None = None  # as last handed out
         self._done = np.zeros(env.num_envs, dtype=bool)
 
@@ -317,12 +339,12 @@ class VectorObservationNoise(VectorWrapper, RecordConstructorArgs):
         return {"clean_observation": values, "_clean_observation": own_copy(rows)}
 
 
-def _published_scale(env: VectorEnv) -> Any:
-    """``noise_scale`` as the vector environment or its first sub-environment publishes it, else ``None``."""
+def _published(env: VectorEnv, name: str) -> Any:
+    """An attribute as the vector environment or its first sub-environment publishes it, else ``None``."""
     base = env.unwrapped
-    if hasattr(base, "noise_scale"):
-        return base.noise_scale
+    if hasattr(base, name):
+        return getattr(base, name)
     # Asking first: an attribute that is missing in a worker process would end that worker.
-    if hasattr(base, "call") and all(base.call("has_wrapper_attr", "noise_scale")):
-        return base.call("get_wrapper_attr", "noise_scale")[0]
+    if hasattr(base, "call") and all(base.call("has_wrapper_attr", name)):
+        return base.call("get_wrapper_attr", name)[0]
     return None

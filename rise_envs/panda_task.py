@@ -62,6 +62,11 @@ class PandaTask(goals.GoalAPI):
         """Standard deviation of the reading at noise level 1, per channel."""
         return {"obstacle": np.array(self.task(self.params).noise_scale)}
 
+    @property
+    def noise_channels(self) -> dict[str, dict[str, tuple[int, ...]]]:
+        """The channels of each group that noise can be limited to."""
+        return {"obstacle": self.task(self.params).noise_channels}
+
 
 def _pose(state: Array) -> tuple[Array, Array]:
     """The hand's frame: its position, axes parallel to the world's."""

@@ -69,6 +69,15 @@ class Task:
         """The shapes of these parts in a single observation."""
         return {key: (width,) for key, width in self.widths.items()}
 
+    @cached_property
+    def noise_channels(self) -> dict[str, tuple[int, ...]]:
+        """Which numbers of a reading are positions, velocities and radii: what noise can be limited to."""
+        parts = self.split(np.arange(self.widths["obstacle"], dtype=np.float64)[None])
+        return {
+            name: tuple(part.astype(int).ravel().tolist())
+            for name, part in zip(("position", "velocity", "radius"), parts, strict=True)
+        }
+
     def split(self, reading: Array) -> tuple[Array, Array, Array]:
         """Readings (B, C) as positions (B, N, D), velocities (B, N, D) and radii (B, N)."""
         c = reading.reshape(-1, self.n_obstacles, 2 * self.dim + 1)

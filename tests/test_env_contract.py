@@ -170,6 +170,9 @@ def test_task_describes_the_environment(env_id: str, env: Any) -> None:
     assert observation["desired_goal"].shape == (task.dim,)
     assert observation["obstacle"].shape == (task.n_obstacles * (2 * task.dim + 1),)
     np.testing.assert_array_equal(unwrapped.noise_scale["obstacle"], task.noise_scale)
+    assert sorted(c for group in unwrapped.noise_channels["obstacle"].values() for c in group) == list(
+        range(len(task.noise_scale))
+    )
     position, rotation = task.pose(observation["observation"][None])
     np.testing.assert_allclose(position[0], observation["achieved_goal"])
     np.testing.assert_allclose(rotation[0] @ rotation[0].T, np.eye(task.dim), atol=1e-12)

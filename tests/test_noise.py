@@ -8,10 +8,22 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
 
 from rise_envs import streams
-from rise_envs.noise import NOISE_MODELS, corrupt, make_noise
-from rise_envs.noise_models import Compose, Delay, Dropout, EpisodeBias, NoiseModel, Quantise, StepNoise
+from rise_envs.noise import NOISE_MODELS, corrupt, make_noise, parts_of
+from rise_envs.noise_models import (
+    Compose,
+    Delay,
+    Dropout,
+    EpisodeBias,
+    NoiseModel,
+    Only,
+    Outlier,
+    Quantise,
+    StepNoise,
+)
 
 EVERY_MODEL = [*NOISE_MODELS, "step+episode", "step+dropout:0.3+delay:2", "dropout+quantise:0.5+drift"]
+EVERY_MODEL += ["step@velocity", "delay:2@position+dropout:0.4@velocity+outlier@radius"]
+GROUPS = {"position": (0, 1), "velocity": (2, 3), "radius": (4,)}
 SCALE = np.array([1.0, 0.05, 3.0, 0.0, 20.0])
 MOVING = SCALE > 0
 
@@ -53,9 +65,9 @@ def assert_uncorrelated(a: np.ndarray, b: np.ndarray) -> None:
 def test_level_0_is_the_identity_to_the_last_bit(noise):
     readings = some_readings(3, 20)
     readings[0, :2] = [-0.0, 0.0, 1e300, -1e-300, np.pi]
-    noisy, state = [], make_noise(noise, level=0).reset(keys_of(3), 5)
+    noisy, state = [], make_noise(noise, 0, GROUPS).reset(keys_of(3), 5)
     for t in range(20):
-        now, state = make_noise(noise, level=0)(readings[:, t], SCALE, np.full(3, t), state)
+        now, state = make_noise(noise, 0, GROUPS)(readings[:, t], SCALE, np.full(3, t), state)
         noisy.append(now)
     assert np.stack(noisy, 1).tobytes() == readings.tobytes()
 
@@ -70,20 +82,20 @@ def test_without_scale_amplitude_models_are_the_identity(noise):
 @pytest.mark.parametrize("noise", EVERY_MODEL)
 def test_an_episode_gets_the_same_noise_alone_and_in_any_batch(noise):
     readings, keys = some_readings(6, 30), keys_of(6)
-    together = corrupt(noise, readings, SCALE, keys)
+    together = corrupt(noise, readings, SCALE, keys, GROUPS)
     some = [4, 1]
-    assert_array_equal(corrupt(noise, readings[some], SCALE, keys[some]), together[some])
+    assert_array_equal(corrupt(noise, readings[some], SCALE, keys[some], GROUPS), together[some])
     for row in range(6):
-        alone = corrupt(noise, readings[row : row + 1], SCALE, keys[row : row + 1])
+        alone = corrupt(noise, readings[row : row + 1], SCALE, keys[row : row + 1], GROUPS)
         assert_array_equal(alone[0], together[row])
 
 
 @pytest.mark.parametrize("noise", EVERY_MODEL)
 @pytest.mark.parametrize("ahead", [2, 7, 64])
 def test_drawing_ahead_changes_no_number(noise, ahead):
-    readings, keys, model = some_readings(3, 40), keys_of(3), make_noise(noise)
+    readings, keys, model = some_readings(3, 40), keys_of(3), make_noise(noise, groups=GROUPS)
     state = model.reset(keys, 5, ahead)
-    for t, expected in enumerate(corrupt(noise, readings, SCALE, keys).swapaxes(0, 1)):
+    for t, expected in enumerate(corrupt(noise, readings, SCALE, keys, GROUPS).swapaxes(0, 1)):
         noisy, state = model(readings[:, t], SCALE, np.full(3, t), state)
         assert_array_equal(noisy, expected)
 
@@ -91,8 +103,8 @@ def test_drawing_ahead_changes_no_number(noise, ahead):
 @pytest.mark.parametrize("noise", EVERY_MODEL)
 def test_rows_on_different_clocks_do_not_mix(noise):
     """Rows 0 and 1 of one batch, row 1 started five steps later, both drawn ahead."""
-    readings, keys, model = some_readings(2, 30), keys_of(2), make_noise(noise)
-    expected = corrupt(noise, readings, SCALE, keys)
+    readings, keys, model = some_readings(2, 30), keys_of(2), make_noise(noise, groups=GROUPS)
+    expected = corrupt(noise, readings, SCALE, keys, GROUPS)
 
     def first_five(state):
         noisy = None
@@ -116,7 +128,7 @@ def test_rows_on_different_clocks_do_not_mix(noise):
 
 @pytest.mark.parametrize("noise", EVERY_MODEL)
 def test_no_argument_is_changed(noise):
-    model, keys = make_noise(noise), keys_of(2)
+    model, keys = make_noise(noise, groups=GROUPS), keys_of(2)
 
     def frozen(x):
         if isinstance(x, tuple):
@@ -134,7 +146,7 @@ def test_no_argument_is_changed(noise):
 @pytest.mark.parametrize("noise", [n for n in EVERY_MODEL if n not in ("delay", "quantise")])
 def test_other_episodes_get_other_noise(noise):
     readings = np.repeat(some_readings(1, 30), 2, axis=0)
-    noisy = corrupt(noise, readings, SCALE, keys_of(2))
+    noisy = corrupt(noise, readings, SCALE, keys_of(2), GROUPS)
     assert (noisy[0] != noisy[1]).any()
 
 
@@ -148,6 +160,36 @@ def test_step_noise_is_normal_and_independent_in_every_way():
     assert_uncorrelated(e[1:], e[:-1])  # episodes
     correlation = np.corrcoef(e.reshape(-1, e.shape[-1]).T)
     assert np.abs(correlation - np.eye(len(correlation))).max() < 4.5 / np.sqrt(500 * 40)
+
+
+def test_outliers_are_a_contaminated_normal():
+    """Share, moments and law against the closed forms of (1 − p) N(0, 1) + p N(0, 10²)."""
+    p, n = 0.1, 20_000
+    e = errors("outlier:0.1:2", n_episodes=500, n_steps=40).reshape(n, -1) / 2
+
+    def law(x):
+        return (1 - p) * stats.norm.cdf(x) + p * stats.norm.cdf(x / 10)
+
+    for column in e.T:
+        assert stats.kstest(column, law).pvalue > 1e-4
+    variance = 1 - p + 100 * p
+    fourth = 3 * (1 - p + 10_000 * p)
+    eighth = 105 * (1 - p + 1e8 * p)
+    assert_allclose(e.mean(0), 0, atol=4.5 * np.sqrt(variance / n))
+    assert_allclose((e**2).mean(0), variance, atol=4.5 * np.sqrt((fourth - variance**2) / n))
+    assert_allclose((e**4).mean(0), fourth, atol=4.5 * np.sqrt((eighth - fourth**2) / n))
+    # A whole reading is an outlier or none: judged by one channel, the others are 10 times larger as well.
+    far = np.abs(e[:, 0]) > 6  # of N(0, 1) one in 10⁹
+    assert far.mean() == pytest.approx(2 * p * stats.norm.sf(0.6), abs=4.5 * np.sqrt(p / n))
+    assert_standard_normal(e[far][:, 1:], 10)
+    steps = far.reshape(500, 40)
+    assert_uncorrelated(steps[:, 1:], steps[:, :-1])
+
+
+@pytest.mark.parametrize(("probability", "deviation"), [(0, 1.0), (1, 10.0)])
+def test_certain_outliers(probability, deviation):
+    e = errors(f"outlier:{probability}", 500, 40)
+    assert_standard_normal(e.reshape(-1, e.shape[-1]), deviation)
 
 
 def test_a_level_multiplies_the_deviation_of_every_channel():
@@ -212,6 +254,49 @@ def test_levels_of_the_models_without_amplitude():
     assert make_noise("quantise", 0.5) == Quantise(0.5)
 
 
+# Groups of channels
+
+
+@pytest.mark.parametrize("noise", NOISE_MODELS)
+@pytest.mark.parametrize("group", GROUPS)
+def test_noise_in_a_group_is_that_of_all_channels_kept_there(noise, group):
+    readings, keys, inside = some_readings(4, 30), keys_of(4), list(GROUPS[group])
+    everywhere = corrupt(noise, readings, SCALE, keys)
+    noisy = corrupt(f"{noise}@{group}", readings, SCALE, keys, GROUPS)
+    assert_array_equal(noisy[..., inside], everywhere[..., inside])
+    outside = [c for c in range(5) if c not in inside]
+    assert noisy[..., outside].tobytes() == readings[..., outside].tobytes()
+
+
+def test_groups_by_hand():
+    readings = np.arange(20.0).reshape(1, 4, 5)
+    expected = readings.copy()
+    expected[0, :, 2:4] = readings[
+        0, [0, 0, 0, 1], 2:4
+    ]  # two steps late, the first until there is one so old
+    expected[0, :, 4] = [0, 10, 10, 20]  # 4, 9, 14, 19 on a grid of 10
+    noisy = corrupt("delay:2@velocity+quantise:0.5@radius", readings, SCALE, keys_of(1), GROUPS)
+    assert_array_equal(noisy, expected)
+
+
+def test_parts_in_groups_have_streams_of_their_own():
+    noise, zeros = "step@position+step@velocity+episode@velocity", np.zeros((800, 5, 5))
+    e = corrupt(noise, zeros, 1.0, keys_of(800), GROUPS)
+    assert (e[..., 4] == 0).all()
+    assert_standard_normal(e[..., :2].reshape(-1, 2))
+    assert_standard_normal(e[:, 0, 2:4], np.sqrt(2))
+    assert_uncorrelated(e[..., :2], e[..., 2:4])
+
+
+def test_a_level_holds_in_groups_too():
+    assert make_noise("step@position+delay:2@radius", 0.5) == Compose(
+        (Only(StepNoise(0.5), "position"), Only(Delay(1), "radius"))
+    )
+    assert make_noise(Only(StepNoise() + Delay(2), "x"), 2, {"x": [3]}) == Only(
+        StepNoise(2) + Delay(4), "x", (3,)
+    )
+
+
 # Compositions
 
 
@@ -255,6 +340,9 @@ def test_texts():
     assert make_noise(" step:2 + dropout:0.3 ") == StepNoise(2) + Dropout(0.3)
     assert make_noise("step:1e+2", level=1.0) == StepNoise(100)
     assert make_noise(StepNoise(3), level=2) == StepNoise(6)
+    assert make_noise("outlier:0.1", level=2) == Outlier(0.1, 2)
+    assert make_noise(" step:2 @ radius + delay") == Compose((Only(StepNoise(2), "radius"), Delay()))
+    assert parts_of("step:2@radius+mine:1:2") == [("step", ("2",), "radius"), ("mine", ("1", "2"), "")]
 
 
 @pytest.mark.parametrize(
@@ -266,6 +354,16 @@ def test_texts():
         ("step+", "unknown noise model ''"),
         ("step:x", "must be a number"),
         ("step:1:2", "too many parameters"),
+        ("step@", "'step@': after '@' stands one group"),
+        ("step@radius@position", "after '@' stands one group"),
+        (
+            "step@radius:2+delay",
+            "no group 'radius:2' of reading channels, there are: position, velocity, radius; did",
+        ),
+        ("step+delay@radious", "did you mean 'radius'"),
+        ("@radius", "unknown noise model ''"),
+        ("outlier:2", r"outlier: probability must be a finite number in \[0, 1\]"),
+        ("outlier:0.1:-1", "outlier: deviation"),
         ("step:-1", "step: deviation must be a finite number ≥ 0"),
         ("step:nan", "step: deviation"),
         ("drift:inf", "drift: rate"),
@@ -278,7 +376,18 @@ def test_texts():
 )
 def test_wrong_models(text, message):
     with pytest.raises(ValueError, match=message):
-        make_noise(text)
+        make_noise(text, groups=GROUPS)
+
+
+def test_groups_that_are_not_known():
+    readings, keys = some_readings(2, 3), keys_of(2)
+    with pytest.raises(ValueError, match="channels of the group 'radius' are not known"):
+        corrupt("step@radius", readings, SCALE, keys)
+    with pytest.raises(ValueError, match="names none: pass noise_channels"):
+        make_noise("step@radius", groups={})
+    for wrong in ((5,), (-1,)):
+        with pytest.raises(ValueError, match=r"group 'radius' are .* of 5"):
+            corrupt("step@radius", readings, SCALE, keys, {"radius": wrong})
 
 
 @pytest.mark.parametrize("level", [-0.1, np.nan, np.inf, "1", None])

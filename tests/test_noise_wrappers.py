@@ -21,6 +21,8 @@ from rise_envs.task import task_of
 
 MODES = list(AutoresetMode)
 MODELS = ["step", "episode", "step+dropout:0.4+delay:2", "drift:1+quantise:0.3"]
+MODELS += ["outlier:0.3", "step@velocity+delay:2@position"]
+GROUPS = {"position": [0, 1], "velocity": [2, 3]}
 
 
 class Walk(gym.Env):
@@ -38,6 +40,7 @@ class Walk(gym.Env):
     def __init__(self):
         self.perceived = None
         self.noise_scale = {"obstacle": np.array([[0.1, 1.0], [2.0, 0.0]])}
+        self.noise_channels = {"obstacle": GROUPS}
         self.resets = 0
 
     def reset(self, *, seed=None, options=None):
@@ -229,6 +232,45 @@ def test_the_published_scale_is_used_or_1():
     assert_array_equal(scale, [5, 6, 2, 2, 2, 2])
 
 
+@pytest.mark.parametrize("env_id", rise_envs.ENVS)
+def test_noise_in_a_group_of_every_environment(env_id):
+    """Columns by hand: D positions, D velocities, a radius."""
+    with gym.make(env_id) as env:
+        dim = {5: 2, 7: 3}[env.observation_space["obstacle"].shape[0]]
+        for group, columns in (
+            ("position", range(dim)),
+            ("velocity", range(dim, 2 * dim)),
+            ("radius", [2 * dim]),
+        ):
+            observation, info = ObservationNoise(env, f"step@{group}").reset(seed=0)
+            changed = observation["obstacle"] != info["clean_observation"]["obstacle"]
+            assert np.flatnonzero(changed).tolist() == list(columns)
+
+
+def test_groups_of_several_obstacles_and_of_several_keys():
+    observation, info = ObservationNoise(vehicle(n_obstacles=2), "step@radius").reset(seed=0)
+    changed = observation["obstacle"] != info["clean_observation"]["obstacle"]
+    assert np.flatnonzero(changed).tolist() == [4, 9]
+    batch = VectorObservationNoise(gym.make_vec("RISE-GroundVehicle-v0", 2, n_obstacles=2), "step@velocity")
+    observation, info = batch.reset(seed=0)
+    changed = observation["obstacle"] != info["clean_observation"]["obstacle"]
+    assert np.flatnonzero(changed[0]).tolist() == np.flatnonzero(changed[1]).tolist() == [2, 3, 7, 8]
+    named = {"desired_goal": {"mine": [1]}, "obstacle": {"mine": [0, 3]}}
+    env = ObservationNoise(
+        Walk(), "step@mine", ["desired_goal", "obstacle"], noise_scale=1.0, noise_channels=named
+    )
+    observation, info = env.reset(seed=0)
+    clean = info["clean_observation"]
+    assert ((observation["desired_goal"] != clean["desired_goal"]) == [False, True]).all()
+    assert ((observation["obstacle"] != clean["obstacle"]) == [[True, False], [False, True]]).all()
+
+
+def test_a_spec_keeps_groups():
+    env = ObservationNoise(vehicle(), "step@mine", noise_channels={"obstacle": {"mine": [4]}})
+    again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
+    assert_equal(episode(again, seed=1)[0], episode(env, seed=1)[0])
+
+
 class Plain(gym.Env):
     action_space = spaces.Discrete(2)
 
@@ -251,6 +293,27 @@ FLOATS = spaces.Box(-1, 1, (3,), np.float32)
         (FLOATS, {"noise_scale": [1, 2]}, r"noise_scale.*broadcast to \(3,\)"),
         (FLOATS, {"noise_scale": "big"}, "noise_scale"),
         (FLOATS, {"noise_scale": {"a": 1}}, "noise_scale must have the noised keys"),
+        (
+            FLOATS,
+            {"noise": "step@x"},
+            "no group 'x' of reading channels, the environment names none: pass noise_ch",
+        ),
+        (
+            FLOATS,
+            {"noise": "step@x", "noise_channels": {"y": [0]}},
+            "no group 'x' of reading channels, there are: y",
+        ),
+        (
+            FLOATS,
+            {"noise_channels": {"x": [3]}},
+            "noise_channels of 'observation' must be lists.*from 0 to 2",
+        ),
+        (FLOATS, {"noise_channels": {"x": [0.5]}}, "noise_channels.*whole numbers"),
+        (FLOATS, {"noise_channels": {"x": 1}}, "noise_channels.*lists"),
+        (FLOATS, {"noise_channels": {"x": []}}, "noise_channels.*lists"),
+        (FLOATS, {"noise_channels": {"x": [-1]}}, "noise_channels.*from 0"),
+        (FLOATS, {"noise_channels": [0]}, "noise_channels.*by group"),
+        (spaces.Dict(a=FLOATS), {"keys": "a", "noise_channels": {"x": [0]}}, r"noised keys, of \['a'\]"),
         (FLOATS, {"keys": ("a",)}, "need a Dict observation space"),
         (spaces.Box(0, 255, (3,), np.uint8), {}, "Box of floats"),
         (spaces.Discrete(3), {}, "Box of floats"),
@@ -332,23 +395,25 @@ def assert_same(ours, theirs):
 @pytest.mark.parametrize("mode", MODES, ids=str)
 @pytest.mark.parametrize("make", [Walk, BoxWalk])
 def test_the_twin_gives_what_wrapped_environments_give(make, mode, noise):
-    twin = VectorObservationNoise(SyncVectorEnv([make] * N, autoreset_mode=mode), noise)
-    theirs = run(reference(make, mode, noise=noise), mode, seed=4)
+    arguments = {"noise": noise} | ({} if make is Walk else {"noise_channels": GROUPS})
+    twin = VectorObservationNoise(SyncVectorEnv([make] * N, autoreset_mode=mode), **arguments)
+    theirs = run(reference(make, mode, **arguments), mode, seed=4)
     assert_same(run(twin, mode, seed=4), theirs)
     ends = [step[2] | step[3] for step in theirs if len(step) == 5]
     assert np.sum(ends, axis=0).min() >= 2, "every row must have gone through a reset"
 
 
+@pytest.mark.parametrize("noise", ["step", "step@velocity"])
 @pytest.mark.parametrize("mode", MODES, ids=str)
-def test_the_twin_of_processes(mode):
-    twin = VectorObservationNoise(AsyncVectorEnv([Walk] * N, autoreset_mode=mode))
+def test_the_twin_of_processes(mode, noise):
+    twin = VectorObservationNoise(AsyncVectorEnv([Walk] * N, autoreset_mode=mode), noise)
     try:
-        assert_same(run(twin, mode, seed=4), run(reference(Walk, mode), mode, seed=4))
+        assert_same(run(twin, mode, seed=4), run(reference(Walk, mode, noise=noise), mode, seed=4))
     finally:
         twin.close()
 
 
-@pytest.mark.parametrize("noise", MODELS[1:3])
+@pytest.mark.parametrize("noise", [*MODELS[1:3], MODELS[-1]])
 @pytest.mark.parametrize("mode", MODES, ids=str)
 def test_the_twin_of_a_native_vector_environment(mode, noise):
     native = gym.make_vec(

@@ -68,6 +68,10 @@ CASES = {
     "missing": make_summary()[:-2] + make_summary(envs=(VEHICLE,), agents=("expert",)),
     "foreign": make_summary(envs=("parking-v0",), noise_model="step+dropout:0.3"),
     "nothing noisy": make_summary(levels=(0.0,)),
+    "long noise": make_summary(
+        noise_model="step:0.5@position+episode:0.5@radius+outlier:0.05@velocity+delay:2"
+    ),
+    "long noise, one task": make_summary(envs=(VEHICLE,), noise_model="step@position+episode:0.5@radius"),
 }
 
 
@@ -219,5 +223,11 @@ def test_labels_read_as_words():
         labels.noise_label("step+delay:2+mine:3")
         == "fresh noise at every step + delayed readings (2) + mine (3)"
     )
+    assert labels.noise_label("episode@position") == "one constant error per episode, positions only"
+    assert (
+        labels.noise_label("delay:2@radius + mine@hand")
+        == "delayed readings (2), radii only + mine, hand only"
+    )
+    assert labels.noise_label("outlier:0.1") == "fresh noise with outliers (0.1)"
     assert labels.count([1], "episode") == "1 episode"
     assert labels.count([2000, 500, 2000], "episode") == "500–2,000 episodes"

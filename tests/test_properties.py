@@ -26,7 +26,7 @@ from rise_envs.vehicle_world import Params, World
 
 NATIVE = [env_id for env_id, (_, vector_entry, _) in ENVS.items() if vector_entry]
 TASK = task_of("RISE-GroundVehicle-v0")
-MODELS = [*NOISE_MODELS, "step+dropout:0.3+delay:2"]
+MODELS = [*NOISE_MODELS, "step+dropout:0.3+delay:2", "step@position+delay@velocity"]
 wild = st.floats(-1e9, 1e9, width=32)
 
 
@@ -221,7 +221,7 @@ def test_noise_changes_readings_only_and_none_changes_nothing(env_id: str, noise
     """The same seed with noise, with level 0, with scale 0 and bare: one and the same trajectory."""
     bare = gym.make(env_id)
     silent = {"level 0": {"noise_level": 0.0}}
-    if noise in ("step", "episode", "drift", "quantise"):  # the others do not add, they hold back
+    if noise in ("step", "outlier", "episode", "drift", "quantise"):  # the others do not add, they hold back
         silent["scale 0"] = {"noise_scale": 0.0}
     wrapped = {name: ObservationNoise(gym.make(env_id), noise, **kwargs) for name, kwargs in silent.items()}  # type: ignore[arg-type]
     noisy = ObservationNoise(gym.make(env_id), noise)

@@ -278,8 +278,8 @@ def test_variants_are_called_as_the_run_called_them(folder):
 
 
 def test_every_noise_model_has_its_figures(tmp_path):
-    report.publish(episodes(("step", "drift", "step+delay:2")), RECORD, tmp_path)
-    marks = ("", "-drift", "-step-delay-2")
+    report.publish(episodes(("step", "drift", "step+delay:2", "episode:0.5@radius")), RECORD, tmp_path)
+    marks = ("", "-drift", "-step-delay-2", "-episode-0.5-radius")
     figures = {f"{name}{mark}.png" for name in ("comparison", "noise_curve") for mark in marks}
     assert {path.name for path in tmp_path.glob("*.png")} == figures
     page = (tmp_path / "summary.md").read_text()

@@ -188,6 +188,8 @@ def test_workers_do_not_change_the_tables(run, tmp_path):
         (["--expert", "mixtur"], "did you mean 'mixture'"),
         (["--noise-model", "stepp"], "did you mean 'step'"),
         (["--noise-model", "step", "episod"], "did you mean 'episode'"),
+        (["--noise-model", "step@positon"], "did you mean 'position'"),
+        (["--noise-model", "step@"], "after '@' stands one group"),
         (["--agents", "rise-meen"], "did you mean 'rise-mean'"),
         (["--agents", "pcbc+kalmann"], "did you mean 'kalman'"),
         (["--filter", "kalmann"], "did you mean 'kalman'"),

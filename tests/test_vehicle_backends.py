@@ -150,7 +150,7 @@ def test_parameters_without_room_are_refused_and_nothing_has_started(other: dict
         env.step(np.zeros((3, 2)))
 
 
-@pytest.mark.parametrize("noise", [*NOISE_MODELS, "step+dropout:0.3+delay:2"])
+@pytest.mark.parametrize("noise", [*NOISE_MODELS, "step+dropout:0.3+delay:2@radius"])
 @pytest.mark.parametrize("mode", list(AutoresetMode))
 def test_noise_on_tensors_is_that_on_arrays(noise: str, mode: AutoresetMode) -> None:
     a, b = (
