@@ -62,7 +62,7 @@ def parser() -> Parser:
         type=float,
         default=1.0,
         metavar="P",
-        help="points that the chosen settings may lose on true readings (default: 1)",
+        help="points that the chosen settings may lose to the best agent on true readings (default: 1)",
     )
     p.add_argument(
         "--demos",

@@ -7,7 +7,7 @@ robustness must not be bought with what a policy does when it sees well.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 CLEAN, NOISY = 0.0, 1.0  # the noise levels that settings are judged at
@@ -40,20 +40,28 @@ def mean(rates: Sequence[Rates]) -> Rates:
     return Rates(*(math.fsum(column) / len(rates) for column in zip(*rates, strict=True)))
 
 
-def ranked(rates: Mapping[int, Rates], clean_loss: float) -> list[int]:
+def best_clean(rates: Iterable[Rates]) -> Rates:
+    """Those that are best on true readings, by the mean of both rates there; of equal ones the higher score.
+
+    Raises:
+        ValueError: none are given.
+    """
+    return max(rates, key=lambda rate: (rate.clean, rate.score))
+
+
+def ranked(rates: Mapping[int, Rates], clean_loss: float, best: Rates) -> list[int]:
     """Trials, best first.
 
-    Those come first whose rates on true readings are both at most ``clean_loss`` below the rates of the trial that is
-    best there (by their mean); among them the higher score is better. The others follow, by their score, too. Of equal
-    trials the one with the lower number is better: trial 0 has the agent's defaults.
+    Those come first whose rates on true readings are both at most ``clean_loss`` below those of ``best``; among them
+    the higher score is better. The others follow, by their score, too. Of equal trials the one with the lower number is
+    better: trial 0 has the agent's defaults.
 
     Args:
         rates: of each trial of one round, by its number.
         clean_loss: in [0, 1].
+        best: the best on true readings of all agents that are searched for an environment: what one agent can do when
+            it sees well no other one may give up for robustness.
     """
-    if not rates:
-        return []
-    best = rates[min(rates, key=lambda n: (-rates[n].clean, -rates[n].score, n))]
 
     def loses(rate: Rates) -> bool:
         loss = max(best.clean_safety - rate.clean_safety, best.clean_reach - rate.clean_reach)
@@ -62,6 +70,6 @@ def ranked(rates: Mapping[int, Rates], clean_loss: float) -> list[int]:
     return sorted(rates, key=lambda n: (loses(rates[n]), -rates[n].score, n))
 
 
-def finalists(rates: Mapping[int, Rates], clean_loss: float, trials: int) -> list[int]:
+def finalists(rates: Mapping[int, Rates], clean_loss: float, best: Rates, trials: int) -> list[int]:
     """The best quarter of ``trials``, rounded up; fewer only if fewer were measured."""
-    return ranked(rates, clean_loss)[: -(-trials // KEPT)]
+    return ranked(rates, clean_loss, best)[: -(-trials // KEPT)]

@@ -11,7 +11,7 @@ from benchmarks.executors import Failure, run_jobs
 from benchmarks.jobs import Job, demonstrations_folder, recording_jobs, tidy
 from benchmarks.protocol import Plan, imitates
 from benchmarks.tune import report
-from benchmarks.tune.ranking import Rates, finalists, mean, ranked
+from benchmarks.tune.ranking import Rates, best_clean, finalists, mean, ranked
 from benchmarks.tune.studies import Study, condition, drawn_trials
 from rise_agents import demonstrations
 from rise_agents.files import sweep
@@ -131,15 +131,21 @@ def execute(search: Search, sets: Mapping[str, tuple[Path, str]], out: Path, how
     first = {study: range(len(study.trials)) for study in studies}
     failures += _run(_jobs(first, [0], out, how.every), how, "first round: train, judge")
     rates = {study: _measured(study, first[study], [0], out) for study in studies}
-    second = {study: finalists(rates[study], search.clean_loss, len(study.trials)) for study in studies}
+    best = _best(rates)
+    second = {
+        study: finalists(rates[study], search.clean_loss, best[study.env], len(study.trials))
+        for study in studies
+        if rates[study]
+    }
     seeds = range(search.plan.seeds)
     failures += _run(_jobs(second, seeds[1:], out, how.every), how, "second round: train, judge")
 
     found = []
-    for study in studies:
-        final = _measured(study, second[study], seeds, out)
+    finals = {study: _measured(study, trials, seeds, out) for study, trials in second.items()}
+    best = _best(finals)
+    for study, final in finals.items():
         if final:
-            chosen = ranked(final, search.clean_loss)[0]
+            chosen = ranked(final, search.clean_loss, best[study.env])[0]
             trials = tuple(second[study])
             numbers = (chosen, final[chosen], rates[study].get(0), trials, len(seeds), len(rates[study]))
             found.append(report.Found(study, *numbers))
@@ -149,6 +155,14 @@ def execute(search: Search, sets: Mapping[str, tuple[Path, str]], out: Path, how
         report.write_settings(path, tables)
     print("\n".join(tables.values()))
     return failures
+
+
+def _best(rates: Mapping[Study, Mapping[int, Rates]]) -> dict[str, Rates]:
+    """Of all agents of a round the best on true readings, by environment."""
+    envs = {study.env for study, measured in rates.items() if measured}
+    return {
+        env: best_clean(r for s, own in rates.items() if s.env == env for r in own.values()) for env in envs
+    }
 
 
 def _recorded(
