@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 
+import gymnasium as gym
 import imageio.v3 as iio
 import numpy as np
 import pytest
@@ -37,6 +38,7 @@ def run(tmp_path_factory):
 def test_stand_ins_are_evaluated_only_when_asked_for(monkeypatch):
     monkeypatch.setitem(STAND_INS, "RISE-Standin-v0", VEHICLE)
     monkeypatch.setitem(ENVS, "RISE-Standin-v0", ENVS[VEHICLE])
+    monkeypatch.setitem(gym.registry, "RISE-Standin-v0", gym.spec(VEHICLE))
     assert plan_of(parser().parse_args([])).envs == (VEHICLE, "RISE-SafePanda-v0")
     plan = plan_of(parser().parse_args(["--envs", "RISE-Standin-v0", "--agents", "expert"]))
     assert plan.rows("RISE-Standin-v0") == [("expert-cbf", 0), ("expert-mpc", 0), ("expert-mixture", 0)]
