@@ -51,6 +51,7 @@ class Agent(Policy, Protocol):
         evaluate_deterministic: how the agent is meant to act when it is judged.
         Config: the frozen dataclass of its settings.
         PRESETS: per environment id, settings that serve better there than the defaults.
+        BRIEF: settings with which it trains in a second or two, to see that all works; of no use otherwise.
 
     Settings that change how it acts and nothing that it learns are named by a class attribute
     ``ACTING: frozenset[str]``, if it has any: what is trained once then acts with any of them.
@@ -58,6 +59,7 @@ class Agent(Policy, Protocol):
 
     Config: type
     PRESETS: dict[str, dict[str, Any]]
+    BRIEF: dict[str, Any]
     learns_from: str
     evaluate_deterministic: bool
 

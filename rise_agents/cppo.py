@@ -82,6 +82,11 @@ class CPPO:
             **{"gamma": 0.98, "cost_gamma": 0.98, "cost_limit": 0.02},
         },
     }
+    BRIEF: ClassVar[dict[str, Any]] = {
+        # In the environment itself: what compiles a batched arm takes longer than this training.
+        **{"train_env": "", "total_steps": 2_048, "n_envs": 4, "n_steps": 32, "batch_size": 64},
+        **{"restart_every": 3},
+    }
     SEARCH: ClassVar[dict[str, Space]] = {
         EVERYWHERE: {
             "frame": Choice(("body", "features")),

@@ -57,6 +57,7 @@ class PCBC:
     name = "pcbc"
     Config = Config
     PRESETS: ClassVar[dict[str, dict[str, Any]]] = {}
+    BRIEF: ClassVar[dict[str, Any]] = {"updates": 300, "batch_size": 64}
     SEARCH: ClassVar[dict[str, Space]] = {EVERYWHERE: cloning.SEARCH}
     learns_from = "demonstrations"
     evaluate_deterministic = True

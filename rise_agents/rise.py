@@ -98,6 +98,12 @@ class Rise:
     name = "rise"
     Config = Config
     PRESETS: ClassVar[dict[str, dict[str, Any]]] = {}
+    BRIEF: ClassVar[dict[str, Any]] = {
+        "updates": 300,
+        "batch_size": 64,
+        "vae_updates": 300,
+        "vae_batch_size": 64,
+    }
     SEARCH: ClassVar[dict[str, Space]] = {
         EVERYWHERE: {
             **cloning.SEARCH,

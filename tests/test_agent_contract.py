@@ -16,19 +16,13 @@ from rise_agents import AGENTS, agent_class, load_agent, make_agent
 from rise_agents.checkpoint import CheckpointError
 
 VEHICLE = "RISE-GroundVehicle-v0"
-BRIEF = {
-    "rise": {"updates": 30, "vae_updates": 30, "batch_size": 32, "vae_batch_size": 32},
-    "pcbc": {"updates": 30, "batch_size": 32},
-    "cppo": {"total_steps": 512, "n_envs": 4, "n_steps": 64, "batch_size": 128},
-    "rise-belief": {"updates": 30, "belief_updates": 30, "belief_rows": 2_000, "belief_batch_size": 128},
-}
 
 
 @pytest.fixture(scope="module")
 def agents(vehicle_demonstrations):
     made = {}
     for name in AGENTS:
-        agent = make_agent(name, VEHICLE, BRIEF.get(name), seed=3)
+        agent = make_agent(name, VEHICLE, agent_class(name).BRIEF, seed=3)
         source = vehicle_demonstrations if agent.learns_from == "demonstrations" else VEHICLE
         made[name] = agent.learn(source)
     return made
@@ -68,7 +62,7 @@ def test_a_row_does_not_depend_on_its_neighbours(agents, vehicle_demonstrations,
 
 @pytest.mark.parametrize("name", AGENTS)
 def test_same_seed_same_weights(agents, vehicle_demonstrations, name):
-    again = make_agent(name, VEHICLE, BRIEF.get(name), seed=3)
+    again = make_agent(name, VEHICLE, agent_class(name).BRIEF, seed=3)
     again.learn(vehicle_demonstrations if again.learns_from == "demonstrations" else VEHICLE)
     batch = observations(vehicle_demonstrations)
     for one, other in zip(

@@ -548,7 +548,7 @@ def test_resume_training(tmp_path, effort, monkeypatch):
     assert killed >= 0 and faults == []
     # The weights of another training are told apart.
     other = tmp_path / "other.rise"
-    checkpoints.train("pcbc", VEHICLE).save(other)
+    checkpoints.train("pcbc", VEHICLE, updates=7).save(other)
     assert kinds(resume_training.compare(made[0], other)) == ["other weights"]
 
 

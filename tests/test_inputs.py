@@ -26,11 +26,6 @@ from rise_envs.task import env_class, task_of
 VEHICLE = "RISE-GroundVehicle-v0"
 NATIVE = [env_id for env_id, (_, vector_entry, _) in ENVS.items() if vector_entry]
 READ = ("observation", "desired_goal", "obstacle")
-BRIEF = {
-    "rise": {"updates": 5, "vae_updates": 5},
-    "pcbc": {"updates": 5},
-    "cppo": {"total_steps": 256, "n_envs": 4, "n_steps": 64, "batch_size": 128, "n_epochs": 1},
-}
 
 
 def same(a: Any, b: Any) -> None:
@@ -327,7 +322,7 @@ def policies(vehicle_demonstrations: Any) -> Any:
 
     def policy(name: str) -> tuple[Any, str]:
         if name not in made and name in AGENTS:
-            agent = make_agent(name, VEHICLE, BRIEF.get(name))
+            agent = make_agent(name, VEHICLE, agent_class(name).BRIEF)
             source = vehicle_demonstrations if agent.learns_from == "demonstrations" else VEHICLE
             made[name] = agent.learn(source), VEHICLE
         elif name not in made:
@@ -430,9 +425,9 @@ def test_lists_tensors_and_single_precision_are_observations(policies: Any, scen
 def test_raw_observations_that_make_no_sense() -> None:
     from toy_envs import Walk
 
-    agent = make_agent("cppo", "ToyWalk-v0", {**BRIEF["cppo"], "frame": "raw", "batch_size": 64}).learn(
-        Walk(dict_space=True)
-    )
+    agent = make_agent(
+        "cppo", "ToyWalk-v0", {**agent_class("cppo").BRIEF, "frame": "raw", "batch_size": 32}
+    ).learn(Walk(dict_space=True))
     good = {"place": np.zeros((4, 2)), "again": np.zeros((4, 2, 1))}
     assert agent.predict(good)[0].shape == (4, 2)
     for key, part in good.items():
@@ -573,7 +568,7 @@ def test_the_task_tells_the_shapes_of_the_observations(env_id: str, scenes: Any)
 def test_an_environment_of_tensors_is_refused() -> None:
     venv = gym.make_vec(VEHICLE, 4, autoreset_mode=AutoresetMode.SAME_STEP, backend="torch")
     with pytest.raises(ValueError, match=r"observations of NumPy.* as torch\.Tensor"):
-        make_agent("cppo", VEHICLE, BRIEF["cppo"]).learn(venv)
+        make_agent("cppo", VEHICLE, agent_class("cppo").BRIEF).learn(venv)
 
 
 @pytest.mark.parametrize("key", READ)
@@ -584,9 +579,9 @@ def test_an_environment_without_what_the_frame_reads_is_refused(key: str, frame:
     venv.single_observation_space = spaces.Dict(parts)
     venv.observation_space = batch_space(venv.single_observation_space, 4)
     with pytest.raises(ValueError, match=f"'{key}'.*raw"):
-        make_agent("cppo", VEHICLE, {**BRIEF["cppo"], "frame": frame}).learn(venv)
+        make_agent("cppo", VEHICLE, {**agent_class("cppo").BRIEF, "frame": frame}).learn(venv)
     box = gym.make_vec(
         "CartPole-v1", 4, vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP}, vectorization_mode="sync"
     )
     with pytest.raises(ValueError, match="raw"):
-        make_agent("cppo", VEHICLE, {**BRIEF["cppo"], "frame": frame}).learn(box)
+        make_agent("cppo", VEHICLE, {**agent_class("cppo").BRIEF, "frame": frame}).learn(box)

@@ -5,17 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rise_agents import AGENTS, archive, make_agent
+from rise_agents import AGENTS, agent_class, archive, make_agent
 from rise_agents.checkpoint import CheckpointError
 from rise_agents.resume import Resume
 
 VEHICLE = "RISE-GroundVehicle-v0"
-BRIEF = {
-    # Several passes through the data, and an interruption amid one.
-    "rise": {"updates": 150, "vae_updates": 150, "batch_size": 64, "vae_batch_size": 64, "transitions": 2000},
-    "pcbc": {"updates": 150, "batch_size": 64, "transitions": 2000},
-    "cppo": {"total_steps": 2048, "n_envs": 4, "n_steps": 32, "batch_size": 64, "restart_every": 3},
-}
 
 
 class Interrupted(Exception):
@@ -31,7 +25,7 @@ def until(share: float):
 
 
 def learner(name: str, **changed: object):
-    return make_agent(name, VEHICLE, {**BRIEF.get(name, {}), **changed}, seed=3)
+    return make_agent(name, VEHICLE, {**agent_class(name).BRIEF, **changed}, seed=3)
 
 
 def source_of(agent, demonstrations):
@@ -84,7 +78,7 @@ def test_a_file_of_another_training_is_refused(name, vehicle_demonstrations, tmp
     with pytest.raises(Interrupted):
         agent.learn(source_of(agent, vehicle_demonstrations), until(0.5), Resume(path, every=0.0))
     before = path.read_bytes()
-    other = make_agent(name, VEHICLE, BRIEF[name], seed=4)
+    other = make_agent(name, VEHICLE, agent_class(name).BRIEF, seed=4)
     with pytest.raises(CheckpointError, match="with seed 3, this one has 4; remove it"):
         other.learn(source_of(other, vehicle_demonstrations), resume=path)
     other = learner(name, hidden=(16,))

@@ -11,7 +11,7 @@ import pytest
 import torch
 from gymnasium.vector import AutoresetMode
 
-from rise_agents import AGENTS, make_agent
+from rise_agents import AGENTS, agent_class, make_agent
 from rise_agents.demonstrations import generate
 from rise_envs import shared
 from rise_envs.noise import NOISE_MODELS
@@ -175,9 +175,7 @@ def test_noise_on_tensors_is_that_on_arrays(noise: str, mode: AutoresetMode) -> 
 
 @pytest.mark.parametrize("name", AGENTS)
 def test_agents_act_on_tensors_as_on_arrays(name: str) -> None:
-    brief = {"cppo": {"total_steps": 64, "n_envs": 4, "n_steps": 8, "batch_size": 32}}
-    brief |= {"rise": {"updates": 3, "vae_updates": 3}, "pcbc": {"updates": 3}}
-    agent = make_agent(name, ID, brief[name])
+    agent = make_agent(name, ID, agent_class(name).BRIEF)
     agent.learn(generate(ID, "cbf", 3) if agent.learns_from == "demonstrations" else None)
     seen, tensors = (make(**kwargs).reset(seed=1)[0] for kwargs in ({}, {"backend": "torch"}))
     np.testing.assert_array_equal(

@@ -11,21 +11,20 @@ import numpy as np
 
 from benchmarks.faults import processes
 from benchmarks.faults.measure import Effort, Fault, Findings, Tell
-from benchmarks.faults.training import settings, source_of
-from rise_agents import AGENTS, checkpoint, make_agent
+from benchmarks.faults.training import source_of
+from rise_agents import AGENTS, agent_class, checkpoint, make_agent
 from rise_agents.resume import Resume
 
 ENVS = ("RISE-GroundVehicle-v0", "RISE-SafePandaKinematic-v0")
 KILLS = 3
 TRIALS = 4  # of each agent and environment
 _PATIENCE = 300.0  # s for a training
-_LENGTH = {"updates": 300, "vae_updates": 200, "total_steps": 2_048}
 _LEARNER = "import sys; from benchmarks.faults.resume_training import learn; learn(*sys.argv[1:])"
 
 
 def learn(name: str, env: str, output: str, state: str = "") -> None:
     """Train an agent; with ``state``, the file from which the training goes on, written as often as can be."""
-    agent = make_agent(name, env, settings(name, env, **_LENGTH), seed=1)
+    agent = make_agent(name, env, agent_class(name).BRIEF, seed=1)
     agent.learn(source_of(agent, env), resume=Resume(state or None, every=0.0))
     agent.save(output)
 

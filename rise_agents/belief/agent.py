@@ -95,6 +95,10 @@ class RiseBelief:
         "RISE-GroundVehicle-v0": {"margin": 2.0},
         "RISE-SafePanda-v0": {"margin": 0.5, "hidden": (256, 256), "frame": "body"},
     }
+    BRIEF: ClassVar[dict[str, Any]] = {
+        **{"updates": 300, "batch_size": 64},
+        **{"belief_updates": 300, "belief_batch_size": 256, "belief_rows": 10_000},
+    }
     SEARCH: ClassVar[dict[str, Space]] = {
         EVERYWHERE: {
             **cloning.SEARCH,
