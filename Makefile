@@ -4,11 +4,13 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN     = $(VENV)/bin
 STAMP   = $(VENV)/.installed
 ARGS   ?=
+RUN    ?= runs/paper
 
-.PHONY: bench tune speed faults faults-quick coverage test test-slow smoke lint audit format clean help
+.PHONY: bench results tune speed faults faults-quick coverage test test-slow smoke lint audit format clean help
 
 help:
 	@echo "make bench      install, then demonstrations, training, 1,000 noisy scenarios, tables, figures, videos"
+	@echo "make results    publish the run in runs/paper (or RUN=...) into docs/results"
 	@echo "make tune       search settings, with the same budget for each agent, on validation scenarios"
 	@echo "make speed      speed against the peers, into docs/performance.md"
 	@echo "make faults     try to break the suite, into docs/reliability.md: about an hour"
@@ -29,6 +31,9 @@ $(STAMP): pyproject.toml constraints.txt
 
 bench: $(STAMP)
 	$(BIN)/python -m benchmarks.run --agents rise pcbc cppo $(ARGS)
+
+results: $(STAMP)
+	$(BIN)/python -m benchmarks.publish $(RUN) $(ARGS)
 
 smoke: $(STAMP)
 	$(BIN)/python -m benchmarks.run --agents rise pcbc cppo --preset smoke $(ARGS)

@@ -110,13 +110,7 @@ def summary_markdown(summary: Sequence[SummaryRow], run: Mapping[str, Any]) -> s
     if not summary:
         raise ValueError("no results to report: the summary is empty")
     envs = list(dict.fromkeys(row.env for row in summary))
-    blocks = ["# Results"]
-    for env in envs:
-        blocks += _findings(_rows_of(summary, env))
-    if any(row.against for row in summary):
-        seeds = several_seeds(summary)
-        drawn = "training seeds and scenarios" if seeds else "scenarios"
-        blocks.append(_DIFFERENCES.format(drawn) + _SURE * seeds)
+    blocks = ["# Results", *claims(summary)]
     for path, caption in run.get("figures", FIGURES).items():
         blocks.append(f"{'!' if path.endswith('.png') else ''}[{caption}]({path})")
     blocks += ["## Tables", _MEANING + (_SEVERAL_SEEDS if several_seeds(summary) else _ONE_SEED)]
@@ -131,6 +125,18 @@ def summary_markdown(summary: Sequence[SummaryRow], run: Mapping[str, Any]) -> s
     if "command" in run:
         blocks += ["## How to repeat", f"```sh\n{run['command']}\n```"]
     return "\n\n".join(blocks) + "\n"
+
+
+def claims(summary: Sequence[SummaryRow]) -> list[str]:
+    """What was found, in words: paragraphs and lists of Markdown, last what the numbers in them mean."""
+    blocks = []
+    for env in dict.fromkeys(row.env for row in summary):
+        blocks += _findings(_rows_of(summary, env))
+    if any(row.against for row in summary):
+        seeds = several_seeds(summary)
+        drawn = "training seeds and scenarios" if seeds else "scenarios"
+        blocks.append(_DIFFERENCES.format(drawn) + _SURE * seeds)
+    return blocks
 
 
 def _condition(row: SummaryRow) -> tuple[str, float]:

@@ -45,6 +45,18 @@ SCHEMA = pa.schema(
     ]
 )
 KEY = ("env", "agent", "train_seed", "noise_model", "noise_level", "scenario")
+_GRID = (
+    2.0**-13
+)  # about 1e-4; of powers of two, so that the low bytes of all values are zero and cost nothing
+_ROUNDED = ("min_clearance", "episode_return")
+_COMPACT: dict[str, Any] = {
+    "compression_level": 19,
+    "use_dictionary": ["env", "agent", "noise_model", "noise_level", "steps", "episode_cost"],
+    "column_encoding": {
+        **dict.fromkeys(("train_seed", "scenario", "env_seed", "noise_seed"), "DELTA_BINARY_PACKED"),
+        **dict.fromkeys(_ROUNDED, "BYTE_STREAM_SPLIT"),
+    },
+}
 
 
 def from_columns(columns: Mapping[str, Any]) -> pa.Table:
@@ -113,11 +125,31 @@ def write_rows(path: StrPath, table: pa.Table) -> None:
         ValueError: rows that do not follow ``SCHEMA``.
         OSError: the file cannot be written; an earlier one is intact.
     """
+    _write(path, table, {})
+
+
+def write_compact(path: StrPath, table: pa.Table) -> None:
+    """As :func:`write_rows`, in a third of the bytes: about 6 per row instead of 18."""
+    _write(path, table, _COMPACT)
+
+
+def _write(path: StrPath, table: pa.Table, options: Mapping[str, Any]) -> None:
     rows = check(table, str(path)).combine_chunks()
     sink = io.BytesIO()
     # No Arrow schema inside: the Parquet types say it all, and its encoding may change with the version.
-    pq.write_table(rows, sink, compression="zstd", store_schema=False, write_page_checksum=True)
+    pq.write_table(rows, sink, compression="zstd", store_schema=False, write_page_checksum=True, **options)
     atomic_write_bytes(path, sink.getvalue())
+
+
+def rounded(table: pa.Table) -> pa.Table:
+    """Rows whose clearance and return are multiples of 2⁻¹³, about 10⁻⁴; a negative clearance stays negative."""
+    for name in _ROUNDED:
+        values = table[name].to_numpy()
+        nearest = np.round(values / _GRID) * _GRID + 0.0  # + 0: never "-0"
+        if name == "min_clearance":
+            nearest = np.where(values < 0, np.minimum(nearest, -_GRID), nearest)
+        table = table.set_column(table.column_names.index(name), SCHEMA.field(name), pa.array(nearest))
+    return table
 
 
 def read_rows(path: StrPath) -> pa.Table:

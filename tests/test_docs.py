@@ -38,7 +38,7 @@ from rise_envs.task import env_class, task_of
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 TASKS = [env_id for env_id in ENVS if env_id not in STAND_INS]  # what is benchmarked
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
 PICTURES = {DOCS / "images" / "vehicle.png", DOCS / "images" / "panda.png"}  # drawn from a finished run
 PACKAGES = ("rise_envs", "rise_agents", "benchmarks")
 

@@ -1,0 +1,305 @@
+"""What is published of a run: small, without traces of the machine, and all of it what its episodes say."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hand_made import make_rows
+
+from benchmarks import publish, report, results, results_page
+from rise_agents.files import sole_user
+
+PUBLISHED = Path(__file__).parents[1] / "docs" / "results"
+ENVS = ("RISE-GroundVehicle-v0", "RISE-SafePanda-v0")
+RECORD = {
+    "agents": {ENVS[0]: {"rise-seed0": "agents/v/rise-0.rise", "rise-mean-seed0": "agents/v/rise-0.rise"}},
+    "command": "python -m benchmarks.run --agents rise pcbc --config /home/someone/mine.toml --out=/tmp/a/run",
+    "device": "cpu",
+    "failed": [],
+    "plan": {"agents": ["rise", "pcbc"], "envs": list(ENVS)},
+    "platform": "Linux-1.2.3-of-somebody",
+    "python": "3.11.9",
+    "rows": ["rise", "pcbc"],
+    "settings": {"rise@x": {"beta": 0.1, "unit": "m/s"}},
+    "training": {"rise": {ENVS[0]: {"training time": "12 s"}}},
+    "versions": {"numpy": "2.0.0"},
+}
+
+
+def episodes(n=30):
+    """Both agents, two seeds, under two models; level 0 under the first."""
+    rng = np.random.default_rng(0)
+    conditions = (("step", 0.0), ("step", 1.0), ("step", 2.0), ("episode", 1.0))
+    return pa.concat_tables(
+        make_rows(
+            n,
+            env=env,
+            agent=agent,
+            noise_model=model,
+            noise_level=level,
+            train_seed=seed,
+            safe=rng.random(n) < rate,
+            min_clearance=rng.normal(0.3, 0.3, n),
+            episode_return=rng.normal(20, 6, n),
+        )
+        for env in ENVS
+        for agent, rate in (("rise", 0.95), ("pcbc", 0.5))
+        for model, level in conditions
+        for seed in range(2)
+    )
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A run folder, and the folder of what is published of it: to be copied, drawing figures takes a while."""
+    root = tmp_path_factory.mktemp("made")
+    folder = root / "run"
+    (folder / "agents" / "v").mkdir(parents=True)
+    results.write_rows(folder / "episodes.parquet", episodes())
+    (folder / "run.json").write_text(json.dumps(RECORD))
+    curve = [{"share": 0.5, "loss": 2.0}, {"share": 1.0, "loss": 0.25}]
+    training = {"seconds": 12.5, "device": "cpu", "curve": curve}
+    (folder / "agents" / "v" / "rise-0.json").write_text(json.dumps(training))
+    publish.publish(folder, root / "results")
+    return root
+
+
+@pytest.fixture
+def run(made, tmp_path):
+    """A run folder."""
+    return Path(shutil.copytree(made / "run", tmp_path / "run"))
+
+
+@pytest.fixture
+def published(made, tmp_path):
+    """A folder of published results."""
+    return Path(shutil.copytree(made / "results", tmp_path / "results"))
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+# --- what is committed -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(not (PUBLISHED / "episodes.parquet").exists(), reason="no results are committed yet")
+def test_the_committed_results_are_what_their_episodes_say():
+    assert results_page.stale(PUBLISHED) == []
+
+
+# --- what is written -------------------------------------------------------------------------------------------
+
+
+def test_a_run_becomes_a_folder_that_agrees_with_itself(run, published):
+    names = {f"{name}{mark}.png" for name in ("comparison", "noise_curve") for mark in ("", "-episode")}
+    tables = {"episodes.parquet", "summary.csv", "comparisons.csv"}
+    assert set(contents(published)) == names | tables | {"run.json", "summary.md", "README.md"}
+    assert results_page.stale(published) == []
+
+
+def test_the_same_run_gives_the_same_files(run, published, tmp_path):
+    publish.publish(run, tmp_path / "again")
+    assert contents(tmp_path / "again") == contents(published)
+    publish.publish(run, published)
+    assert contents(tmp_path / "again") == contents(published)
+
+
+def test_the_report_makes_the_same_tables_again(published, tmp_path, capsys):
+    assert report.main([str(published), "--out", str(tmp_path / "x")]) == 0
+    for name in ("summary.csv", "comparisons.csv"):
+        assert (tmp_path / "x" / name).read_bytes() == (published / name).read_bytes()
+
+
+def test_episodes_are_those_of_the_run_but_for_the_last_digits(published):
+    stored, rows = results.read_rows(published / "episodes.parquet"), episodes()
+    for name in results.SCHEMA.names:
+        before, after = rows[name].to_numpy(), stored[name].to_numpy()
+        if name in ("min_clearance", "episode_return"):
+            np.testing.assert_allclose(after, before, rtol=0, atol=2**-13)
+        else:
+            np.testing.assert_array_equal(after, before)
+
+
+def test_a_collision_stays_one_when_numbers_are_rounded():
+    clearance = np.array([-1e-9, -0.3, 0.0, 1e-9, 0.25, -0.00013])
+    got = results.rounded(make_rows(6, min_clearance=clearance))["min_clearance"].to_numpy()
+    assert np.array_equal(got < 0, clearance < 0) and not np.signbit(got[2])
+    assert got[[0, 4]].tolist() == [-(2**-13), 0.25]
+    np.testing.assert_allclose(got, clearance, rtol=0, atol=2**-13)
+
+
+def test_compact_rows_are_the_same_rows_in_a_few_bytes(tmp_path):
+    rng, n = np.random.default_rng(0), 1000
+    tables = [
+        make_rows(
+            n,
+            agent=agent,
+            train_seed=seed,
+            noise_level=level,
+            safe=rng.random(n) < 0.95,
+            arrived=rng.random(n) < 0.98,
+            steps=rng.integers(50, 200, n),
+            episode_cost=np.where(rng.random(n) < 0.95, 0.0, rng.integers(1, 20, n)),
+            min_clearance=rng.normal(1.0, 0.9, n),
+            episode_return=rng.normal(20, 6, n),
+        )
+        for agent in ("rise", "pcbc")
+        for seed in range(5)
+        for level in (0.0, 0.5, 1.0, 2.0)
+    ]
+    rows = results.rounded(pa.concat_tables(tables))
+    for name in "ab":
+        results.write_compact(tmp_path / name, rows)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+    assert results.read_rows(tmp_path / "a").equals(rows.combine_chunks())
+    assert pq.read_table(tmp_path / "a").equals(rows)  # by others too
+    assert (tmp_path / "a").stat().st_size < 7.5 * rows.num_rows
+
+
+def test_the_record_says_nothing_of_the_machine(published):
+    record = json.loads((published / "run.json").read_text())
+    assert record["command"] == "python -m benchmarks.run --agents rise pcbc --config mine.toml --out=run"
+    assert not {"platform", "failed"} & set(record)
+    for kept in ("plan", "settings", "versions", "training", "rows", "device", "python"):
+        assert record[kept] == RECORD[kept]
+    end = {"share": 1.0, "loss": 0.25}
+    assert record["trainings"] == {ENVS[0]: {"rise-0": {"seconds": 12.5, "device": "cpu", "end": end}}}
+
+
+# --- the page --------------------------------------------------------------------------------------------------
+
+
+def test_the_page_holds_findings_targets_and_rates(published):
+    page = (published / "README.md").read_text()
+    assert "mine.toml --out=run\n```" in page
+    assert (
+        "- **Ground vehicle**: 2 rows, 60 episodes per row of 2 training seeds and condition; noise" in page
+    )
+    assert len(re.findall(r"^- RISE kept .* than PC-BC", page, re.MULTILINE)) == 4
+    assert re.search(
+        r"^\| `rise` − `pcbc`, `step` 1 \| Ground vehicle \| \d.* \| yes \|$", page, re.MULTILINE
+    )
+    assert (
+        "| `rise` − `cppo`, `step` 1 | Franka Panda | – | – | > 0, all of the interval | not measured |"
+        in page
+    )
+    titles = ["### Ground vehicle: one constant error per episode (`episode`)"]
+    titles += ["### Franka Panda: fresh noise at every step (`step`)"]
+    assert all(title in page for title in titles)
+    (line,) = re.findall(r"Franka Panda: fresh.*\n\n.*\n.*\n(\| RISE .*)", page)
+    rows = [row for row in episodes().to_pylist() if (row["env"], row["agent"]) == (ENVS[1], "rise")]
+    safe = {
+        level: np.mean([r["safe"] for r in rows if (r["noise_model"], r["noise_level"]) == ("step", level)])
+        for level in (0.0, 1.0, 2.0)
+    }
+    cells = [cell.strip() for cell in line.split("|")[2:-1]]
+    assert cells[0].startswith(f"{100 * safe[1.0]:.1f} [")
+    assert cells[2].startswith(f"{100 * safe[0.0]:.1f} / ") and cells[3].startswith(
+        f"{100 * safe[2.0]:.1f} / "
+    )
+
+
+def test_words_that_people_wrote_stay(run, published):
+    page = published / "README.md"
+    before = page.read_text().replace("## Controls\n", "## Controls\n\nMine.\n")
+    begin, end = results_page.BLOCKS["tables"].begin, results_page.BLOCKS["tables"].end
+    head, _, rest = before.partition(begin)
+    page.write_text(f"{head}{begin}\nold\n{end}{rest.partition(end)[2]}")
+    publish.publish(run, published)
+    assert page.read_text() == before
+
+
+def test_figures_of_a_former_run_go(run, published):
+    (published / "comparison-drift.png").write_bytes(b"old")
+    publish.publish(run, published)
+    assert not (published / "comparison-drift.png").exists()
+
+
+# --- what does not agree ---------------------------------------------------------------------------------------
+
+
+def test_a_changed_row_is_noticed(published, capsys):
+    rows = results.read_rows(published / "episodes.parquet").to_pydict()
+    safe = rows["safe"][0] = not rows["safe"][0]
+    rows["reached"][0] = safe and rows["arrived"][0]
+    results.write_compact(published / "episodes.parquet", results.from_columns(rows))
+    assert results_page.stale(published) == ["summary.csv", "comparisons.csv"]
+    before = contents(published)
+    assert publish.main([str(published), "--check"]) == 1
+    error = capsys.readouterr().err
+    assert f"{published}: summary.csv is not what the episodes say" in error and error.count("\n") == 2
+    assert contents(published) == before
+
+
+@pytest.mark.parametrize("block", results_page.BLOCKS)
+def test_a_changed_block_is_noticed(published, block, capsys):
+    page = published / "README.md"
+    begin = results_page.BLOCKS[block].begin
+    page.write_text(page.read_text().replace(begin, f"{begin}\n\nAll is well."))
+    assert results_page.stale(published) == [f"README.md, block {block}"]
+
+
+def test_changed_tables_are_noticed(published):
+    table = published / "comparisons.csv"
+    table.write_text(table.read_text().replace("step", "drift", 1))
+    assert results_page.stale(published) == ["comparisons.csv"]
+
+
+def test_words_outside_of_blocks_are_free(published, capsys):
+    page = published / "README.md"
+    page.write_text(page.read_text() + "\nMore.\n")
+    assert publish.main([str(published), "--check"]) == 0
+    assert "are what the episodes say" in capsys.readouterr().out
+
+
+# --- errors ----------------------------------------------------------------------------------------------------
+
+
+def test_what_cannot_be_published_ends_in_one_line(run, tmp_path, capsys):
+    out = tmp_path / "out"
+    out.mkdir()
+
+    def refused(says, *arguments):
+        assert publish.main([*map(str, arguments)]) == 2
+        error = capsys.readouterr().err
+        assert says in error and error.count("\n") == 1 and error.startswith("benchmarks.publish: ")
+        assert not (out / "episodes.parquet").exists()
+
+    refused("required: RUN_DIR")
+    refused("did you mean '--out'", run, "--uot", out)
+    refused("is not a folder", tmp_path / "absent", "--out", out)
+    refused("not the folder of a finished run", out, "--out", tmp_path / "other")
+    refused("name another folder", run, "--out", run)
+    refused("cannot write", run, "--out", "/proc/nowhere")
+    refused("cannot be read", out, "--check")
+    (out / "README.md").write_text("# Mine\n")
+    refused("must hold the lines", run, "--out", out)
+    (out / "README.md").unlink()
+    with sole_user(run):
+        refused("in use by another process", run, "--out", out)
+    for changes, says in (
+        ({"failed": [{"job": "train"}]}, "failed: give the run's command again"),
+        ({"plan": 3}, "not the record of a run"),
+        ({"agents": [1]}, "not the record of a run"),
+    ):
+        (run / "run.json").write_text(json.dumps({**RECORD, **changes}))
+        refused(says, run, "--out", out)
+    (run / "run.json").write_text(json.dumps(RECORD))
+    (run / "agents" / "v" / "rise-0.json").write_text("{}")
+    refused("not the record of a training", run, "--out", out)
+
+
+def test_the_command_explains_itself():
+    command = [sys.executable, "-m", "benchmarks.publish", "--help"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert "examples:" in done.stdout and "--out DIR" in done.stdout and "docs/results" in done.stdout
