@@ -25,6 +25,7 @@ from benchmarks.jobs import (
 )
 from benchmarks.labels import name_rows, split_row
 from benchmarks.protocol import Plan, imitates
+from benchmarks.sections import sections
 from rise_agents import checkpoint, demonstrations, pretrained
 from rise_agents.files import sweep
 
@@ -76,9 +77,12 @@ def _write_results(out: Path, evaluations: list[Job]) -> None:
     if not parts:
         return
     rows = results.merge(parts, out / report.EPISODES)
-    summary = report.publish(rows, report.read_run(out), out)
-    for env in dict.fromkeys(row.env for row in summary):
-        print(report.summary_table_text(summary, env))
+    run = report.read_run(out)
+    asked, *others = sections(report.publish(rows, run, out), run.get("blocks", ()))
+    for env in dict.fromkeys(row.env for row in asked.rows):
+        print(report.summary_table_text(asked.rows, env))
+    if others:
+        print(f"{len(others)} more tables are in {out / 'summary.md'}\n")
 
 
 def _write_failures(path: Path, failures: list[Failure]) -> None:
@@ -156,6 +160,7 @@ def _write_run(plan: Plan, out: Path, how: How, failures: list[Failure]) -> None
             for env in plan.envs
         },
         "rows": list(dict.fromkeys(row for env in plan.envs for row, _ in plan.rows(env))),
+        "blocks": plan.described(),
         "training": _trained(plan, out),
         "versions": checkpoint.versions(),
         "python": platform.python_version(),

@@ -16,7 +16,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.protocol import PRESETS, Plan, make_plan, with_filters
+from benchmarks.presets import PRESETS
+from benchmarks.protocol import Plan, make_plan, with_filters
 from rise_agents.cli import Parser, prepare_folder
 
 # Those of torch that can train. A name that is none of them is refused without importing torch.
@@ -45,10 +46,9 @@ def parser() -> Parser:
     p.add_argument(
         "--agents",
         nargs="+",
-        default=["rise", "pcbc", "cppo"],
         metavar="NAME",
         help="agents and variants to compare; 'expert' and 'random' add reference rows, NAME+kalman is NAME behind"
-        " a filter, expert+true the experts on true readings (default: rise pcbc cppo)",
+        " a filter, expert+true the experts on true readings (default: the preset's, mostly rise pcbc cppo)",
     )
     p.add_argument(
         "--envs", nargs="+", metavar="ID", help="environments (default: all whose results are reported)"
@@ -93,10 +93,9 @@ def parser() -> Parser:
     p.add_argument(
         "--noise-model",
         nargs="+",
-        default=["step"],
         metavar="MODEL",
         help="step, outlier, episode, drift, dropout, delay, quantise, sums as in step+episode, or on some channels"
-        " only, as in step@position+episode@radius (default: step)",
+        " only, as in step@position+episode@radius (preset quick: step)",
     )
     p.add_argument("--demos", type=int, metavar="N", help="expert episodes to learn from, per environment")
     p.add_argument("--expert", default="mixture", metavar="NAME", help="who demonstrates (default: mixture)")
@@ -162,11 +161,11 @@ def plan_of(arguments: argparse.Namespace) -> Plan:
         arguments.preset,
         parse_settings(arguments.settings),
         arguments.config,
-        agents=with_filters(arguments.agents, arguments.filter),
+        agents=_rows(arguments),
         envs=tuple(dict.fromkeys(arguments.envs or reported)),
         demos=arguments.demos,
         episodes=arguments.episodes,
-        noise_models=tuple(dict.fromkeys(arguments.noise_model)),
+        noise_models=None if arguments.noise_model is None else tuple(dict.fromkeys(arguments.noise_model)),
         noise_levels=None if arguments.noise_levels is None else tuple(sorted(set(arguments.noise_levels))),
         seeds=arguments.seeds,
         expert=arguments.expert,
@@ -177,6 +176,14 @@ def plan_of(arguments: argparse.Namespace) -> Plan:
     check_settings(plan)
     _check_device(arguments.device)
     return plan
+
+
+def _rows(arguments: argparse.Namespace) -> tuple[str, ...] | None:
+    """The rows that were asked for; None: those of the preset."""
+    if arguments.agents is None and not arguments.filter:
+        return None
+    preset = PRESETS.get(arguments.preset)
+    return with_filters(arguments.agents or (preset.agents if preset else ()), arguments.filter)
 
 
 def _has_gpu_driver() -> bool:

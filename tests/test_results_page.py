@@ -107,6 +107,31 @@ def test_a_run_becomes_a_folder_that_agrees_with_itself(run, published):
     assert results_page.stale(published) == []
 
 
+def test_blocks_of_a_run_have_tables_of_their_own(run, tmp_path):
+    record = json.loads((run / "run.json").read_text())
+    asked = {"title": "", "rows": ["rise"], "noise_models": ["step"], "noise_levels": [0, 1, 2], "envs": []}
+    other = {"title": "Is it PC-BC?", "rows": ["rise", "pcbc"], "noise_models": ["step", "episode"]}
+    record["blocks"] = [asked, {**other, "noise_levels": [0, 1], "envs": [ENVS[0]]}]
+    (run / "run.json").write_text(json.dumps(record))
+    publish.publish(run, tmp_path / "out")
+    assert results_page.stale(tmp_path / "out") == []
+    page = (tmp_path / "out" / "README.md").read_text()
+    findings, _, rest = page.partition("## Controls")
+    controls, _, tables = rest.partition("## What was tried")
+    assert "PC-BC" not in findings.replace("pcbc", "") and "PC-BC" not in tables
+    lines = [line for line in controls.splitlines() if line.startswith("|")]
+    assert lines[0] == "| Agent | level 0 | `episode` 1 | `step` 1 |"
+    assert [line.split(" | ")[0] for line in lines[2:]] == ["| RISE", "| PC-BC"]  # of the one environment
+    assert "### Is it PC-BC?" in controls and "(others-ground-vehicle.png)" in controls
+    assert {path.name for path in (tmp_path / "out").glob("*.png")} == {
+        *("comparison.png", "noise_curve.png", "others-ground-vehicle.png")
+    }
+    record["blocks"] = [{**asked, "noise_levels": "all"}]
+    (run / "run.json").write_text(json.dumps(record))
+    with pytest.raises(ValueError, match=r"run\.json is not the record of a run"):
+        publish.publish(run, tmp_path / "out")
+
+
 def test_the_same_run_gives_the_same_files(run, published, tmp_path):
     publish.publish(run, tmp_path / "again")
     assert contents(tmp_path / "again") == contents(published)
