@@ -11,13 +11,18 @@ _AHEAD = 64  # steps whose draws are computed together where one episode acts al
 
 
 class NormalDraws:
-    """``size`` standard normal numbers a step: a pure function of the episode's key and the number of the step."""
+    """``size`` standard normal numbers a step: a pure function of the episode's key and the number of the step.
 
-    def __init__(self, size: int) -> None:
-        self.size = size
+    Args:
+        size: how many.
+        precision: in which they are handed out.
+    """
+
+    def __init__(self, size: int, precision: type = np.float32) -> None:
+        self.size, self.precision = size, precision
         self._ahead: tuple[tuple[int, int], NDArray] = (0, -1), np.zeros(0)
 
-    def __call__(self, keys: NDArray[np.uint64], counter: NDArray[np.uint64]) -> NDArray[np.float32]:
+    def __call__(self, keys: NDArray[np.uint64], counter: NDArray[np.uint64]) -> NDArray:
         """The draws of steps ``counter`` (B,) of the streams ``keys`` (B,): (B, size)."""
         if len(keys) != 1 or not counter[0]:
             return self._draw(keys, counter)
@@ -30,7 +35,7 @@ class NormalDraws:
             self._ahead = ahead
         return ahead[1][place : place + 1]
 
-    def _draw(self, keys: NDArray[np.uint64], steps: NDArray[np.uint64]) -> NDArray[np.float32]:
+    def _draw(self, keys: NDArray[np.uint64], steps: NDArray[np.uint64]) -> NDArray:
         """Numbers step · size and following, (T, size), of the streams; keys are (T,), or (1,) for all steps."""
         numbers = steps[:, None] * np.uint64(self.size) + np.arange(self.size, dtype=np.uint64)
-        return streams.normal(keys[:, None], numbers).astype(np.float32)
+        return streams.normal(keys[:, None], numbers).astype(self.precision)

@@ -51,6 +51,11 @@ class Forward:
             matrices[depth] = np.hstack((matrix, one))
         self.hidden, self.last = matrices[:-1], matrices[-1]
 
+    def layers(self) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
+        """Weights (inputs, outputs) and bias (outputs,) of each layer, as it acts."""
+        plain = [*(matrix[:, :-1] for matrix in self.hidden), self.last]
+        return [(matrix[:-1], matrix[-1]) for matrix in plain]
+
     def __call__(self, *parts: NDArray) -> NDArray[np.float32]:
         """The parts of the inputs, (B, ·) each, to outputs (B, ·); ReLU between the layers."""
         x = np.concatenate((*parts, np.ones((len(parts[0]), 1))), -1, dtype=np.float32, casting="same_kind")

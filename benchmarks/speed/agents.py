@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.speed.envs import VEHICLE, Work, make
-from benchmarks.speed.measure import Effort, Sides, rate
+from benchmarks.speed.measure import Effort, Sides, Unavailable, rate
 
 _CALLS = 200
 BATCH = 1_024
@@ -60,6 +60,48 @@ def predict(effort: Effort, deterministic: bool = False) -> Iterator[Sides]:
     ours, theirs = (calls(each.predict, seen, deterministic) for each in (agent, peer))
     yield Sides(lambda: 1e6 / rate(ours, effort.seconds), lambda: 1e6 / rate(theirs, effort.seconds))
     env.close()
+
+
+@contextmanager
+def onnx(effort: Effort) -> Iterator[Sides]:
+    """One call of onnxruntime with one observation, of RISE of its default size, exported."""
+    import tempfile
+    from pathlib import Path
+
+    from rise_agents import make_agent
+    from rise_agents.export import export, sample
+    from rise_agents.onnx_policy import OnnxPolicy
+
+    agent: Any = make_agent("rise", VEHICLE, {"updates": 5, "vae_updates": 5}).learn(recorded())
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "rise.onnx"
+        try:
+            export(agent, path, sample(agent, 10, 10))
+        except ImportError:
+            raise Unavailable("onnx and onnxruntime are not installed") from None
+        policy = OnnxPolicy(path)
+    env = make(VEHICLE)
+    seen = observations(env, _CALLS)
+    env.close()
+    epsilon = np.zeros((1, agent.config.latent), np.float32)
+    inputs = [{**{key: o[key][None] for key in policy.task.widths}, "epsilon": epsilon} for o in seen]
+    processor: list[float] = []
+
+    def ours() -> float:
+        taken: list[float] = []
+        run, used, ends = policy.session.run, time.process_time(), time.perf_counter() + effort.seconds
+        while time.perf_counter() < ends or not taken:
+            for given in inputs:
+                started = time.perf_counter()
+                run(None, given)
+                taken.append(time.perf_counter() - started)
+        processor.append((time.process_time() - used) / len(taken))
+        return 1e6 * float(np.median(taken))
+
+    yield Sides(
+        ours,
+        note=lambda: f"median of single calls; {1e6 * np.median(processor):.1f} µs of processor time each",
+    )
 
 
 @contextmanager

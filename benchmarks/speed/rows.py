@@ -31,6 +31,7 @@ _ROWS = (
     Row("predict", "`rise.predict`", "µs", _PPO, at_most(0.3), agents.predict),
     Row("predict-mean", "`rise.predict`, deterministic", "µs", _PPO, at_most(0.3),
         partial(agents.predict, deterministic=True)),
+    Row("onnx", "RISE as ONNX", "µs", "", at_most(50), agents.onnx),
     Row("clone-pcbc", "Update of PC-BC", "ms", _BARE, at_most(1.2), partial(agents.cloning, name="pcbc")),
     Row("clone-rise", "Update of RISE", "ms", _BARE, at_most(1.2), partial(agents.cloning, name="rise")),
     Row("workers", "Panda evaluation, 2 workers", "episodes/s", "1 worker", at_least(1.8),

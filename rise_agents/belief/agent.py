@@ -22,6 +22,7 @@ Shapes: B batch, N obstacles, D dimensions, C = 2D + 1 channels of an obstacle.
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -212,8 +213,14 @@ class RiseBelief:
     def _believe(
         self, rows: dict[str, Array], state: State, episode_start: NDArray | None
     ) -> tuple[Array, Array, tuple[NDArray, ...]]:
+        return self._updated(rows, self._begun(rows, state, episode_start), self._network)
+
+    def _updated(
+        self, rows: dict[str, Array], begun: tuple[NDArray, ...], network: Callable[[Array], Any]
+    ) -> tuple[Array, Array, tuple[NDArray, ...]]:
+        """The belief after one more reading, from the state of episodes that have begun; see :meth:`believe`."""
         task, memories, batch = self.task, self.config.memories, len(rows["desired_goal"])
-        origin, rotation, sums, steps = self._begun(rows, state, episode_start)
+        origin, rotation, sums, steps = begun
         n, d = task.n_obstacles, task.dim
         frame = (
             Frame(np.repeat(origin, n, 0), np.repeat(rotation, n, 0)) if n > 1 else Frame(origin, rotation)
@@ -223,7 +230,7 @@ class RiseBelief:
         steps = steps + 1.0
         seen = history.evidence(sums, d)
         goal = frame.point(np.repeat(rows["desired_goal"], n, 0))
-        answer = self._network(posterior.inputs(task, reading, seen, np.repeat(steps, n), goal))
+        answer = network(posterior.inputs(task, reading, seen, np.repeat(steps, n), goal))
         offered = posterior.estimates(reading, seen)
         mu, sigma = posterior.posterior(answer, offered, self.scale, len(memories))
         mu, sigma = (part.reshape(batch, n, -1) for part in (frame.to_world(mu), sigma))
@@ -271,19 +278,30 @@ class RiseBelief:
 
     def _careful(self, rows: dict[str, Array], mu: Array, sigma: Array) -> Array:
         """The readings (B, N·C) to act on: the belief with its margin, no nearer than any demonstration was."""
-        d, batch = self.task.dim, len(mu)
-        c = mu.copy()
+        c = self._widened(mu, sigma)
+        lacking = self._lacking(rows, c)
+        return (self._moved_off(rows, c, lacking) if (lacking > 0).any() else c).reshape(len(mu), -1)
+
+    def _widened(self, mu: Array, sigma: Array) -> Array:
+        """The belief's means (B, N, C), with radii larger by the margin."""
+        d, c = self.task.dim, mu.copy()
         c[..., -1] += self.config.margin * np.sqrt((sigma[..., :d] ** 2).mean(-1) + sigma[..., -1] ** 2)
-        lacking = self._arrays["nearest.clearance"][0] - self._clearance(rows, c.reshape(batch, -1))
-        if not (lacking > 0).any():
-            return c.reshape(batch, -1)
+        return c
+
+    def _lacking(self, rows: dict[str, Array], c: Array) -> Array:
+        """How much nearer (m) obstacles (B, N, C) are than in any demonstration, (B, N)."""
+        return self._arrays["nearest.clearance"][0] - self._clearance(rows, c.reshape(len(c), -1))
+
+    def _moved_off(self, rows: dict[str, Array], c: Array, lacking: Array) -> Array:
+        """Obstacles (B, N, C) made smaller and moved away until nothing is lacking; what was far enough stays."""
+        d, c = self.task.dim, c.copy()
         lacking = np.maximum(lacking, 0.0)
         smaller = np.clip(c[..., -1] - self._arrays["nearest.radius"][0], 0.0, lacking)
         c[..., -1] -= smaller
         away = c[..., :d] - self.task.pose(rows["observation"])[0][:, None]
         distance = np.linalg.norm(away, axis=-1, keepdims=True)
         c[..., :d] += (lacking - smaller)[..., None] * away / np.maximum(distance, 1e-9)
-        return c.reshape(batch, -1)
+        return c
 
     def _clearance(self, rows: dict[str, Array], reading: Array) -> Array:
         """Of the robot's reference ball from each obstacle (m), (B, N)."""

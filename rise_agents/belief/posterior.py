@@ -44,12 +44,9 @@ class Frame(NamedTuple):
         length = np.hypot(x, y)
         cos, sin = np.where(length > 0, x, 1.0), y
         cos, sin = cos / np.where(length > 0, length, 1.0), sin / np.where(length > 0, length, 1.0)
-        rotation = np.zeros((len(goal), task.dim, task.dim))
-        rotation[:, 0, 0] = rotation[:, 1, 1] = cos
-        rotation[:, 1, 0], rotation[:, 0, 1] = sin, -sin
-        if task.dim == 3:
-            rotation[:, 2, 2] = 1.0
-        return cls(origin, rotation)
+        zero, one = np.zeros_like(cos), np.ones_like(cos)
+        rows = [cos, -sin, sin, cos] if task.dim == 2 else [cos, -sin, zero, sin, cos, zero, zero, zero, one]
+        return cls(origin, np.stack(rows, -1).reshape(-1, task.dim, task.dim))
 
     def point(self, world: Array) -> Array:
         """Points (B, D) of the world in this frame."""
