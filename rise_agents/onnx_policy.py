@@ -139,7 +139,7 @@ def _session(path: Path, threads: int) -> Any:
     ort = runtime()
     options = ort.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = threads
-    options.log_severity_level = 3  # errors only
+    options.log_severity_level = 4  # what is wrong is raised
     try:
         content = path.read_bytes()
     except OSError as error:

@@ -10,7 +10,7 @@ import numpy as np
 import onnx
 import onnxruntime
 import pytest
-from onnx import TensorProto, helper
+from onnx import TensorProto, helper, numpy_helper
 
 from rise_agents import agent_class, export, load_agent, make_agent
 from rise_agents.export.__main__ import main
@@ -283,18 +283,28 @@ def test_agents_and_settings_without_a_form(vehicle_demonstrations, belief, tmp_
         build(belief_like)
 
 
-def foreign(metadata):
-    """A model that hands its input on."""
+def foreign(metadata, elsewhere=""):
+    """A model that hands its input on; or one whose weights lie in another file."""
     x = helper.make_tensor_value_info("x", TensorProto.DOUBLE, ["batch", 3])
     y = helper.make_tensor_value_info("action", TensorProto.DOUBLE, ["batch", 3])
-    graph = helper.make_graph([helper.make_node("Identity", ["x"], ["action"])], "g", [x], [y])
+    if elsewhere:
+        weights = numpy_helper.from_array(np.ones(3), "w")
+        weights.ClearField("raw_data")
+        weights.data_location = TensorProto.EXTERNAL
+        for key, value in (("location", elsewhere), ("length", "24")):
+            weights.external_data.add(key=key, value=value)
+        graph = helper.make_graph([helper.make_node("Add", ["x", "w"], ["action"])], "g", [x], [y], [weights])
+    else:
+        graph = helper.make_graph([helper.make_node("Identity", ["x"], ["action"])], "g", [x], [y])
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
     helper.set_model_props(model, metadata)
     return model.SerializeToString()
 
 
-def test_files_that_are_none_of_ours(file, tmp_path):
+def test_files_that_are_none_of_ours(file, tmp_path, monkeypatch, capfd):
     metadata = OnnxPolicy(file).metadata
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "weights").write_bytes(np.ones(3).tobytes())
     path = tmp_path / "other.onnx"
     with pytest.raises(ValueError, match="cannot be read"):
         OnnxPolicy(path)
@@ -302,6 +312,7 @@ def test_files_that_are_none_of_ours(file, tmp_path):
         (b"", "no ONNX file"),
         (b"garbage" * 100, "no ONNX file"),
         (file.read_bytes()[:-100], "no ONNX file"),
+        *[(foreign(metadata, name), "no ONNX file") for name in ("weights", str(tmp_path / "weights"))],
         (foreign({}), "no exported agent"),
         (foreign(metadata), "inputs"),
         (foreign({**metadata, "format": "2"}), "format"),
@@ -311,6 +322,7 @@ def test_files_that_are_none_of_ours(file, tmp_path):
         path.write_bytes(content)
         with pytest.raises(ValueError, match=says):
             OnnxPolicy(path)
+    assert capfd.readouterr() == ("", "")
 
 
 def test_the_command_writes_beside_the_checkpoint(rise, tmp_path, capsys):
