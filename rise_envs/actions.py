@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-def finite_action(action: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """``action`` as float64.
+def finite_action(action: Any, shape: tuple[int, ...], name: str = "action") -> NDArray[np.float64]:
+    """``action`` (or what else has this ``name``) as float64.
 
     Raises:
         ValueError: wrong shape, not of real numbers (a bool is none), or not finite.
@@ -20,12 +20,12 @@ def finite_action(action: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
     except ValueError:  # rows of different lengths
         array = np.asarray(None)
     if array.dtype.kind not in "fiu":
-        raise ValueError(f"action must be numeric with shape {shape}, got {action!r}")
+        raise ValueError(f"{name} must be numeric with shape {shape}, got {action!r}")
     if array.shape != shape:
-        raise ValueError(f"action must have shape {shape}, got shape {array.shape}")
+        raise ValueError(f"{name} must have shape {shape}, got shape {array.shape}")
     if not np.isfinite(array).all():
         where = np.argwhere(~np.isfinite(array))[0].tolist()
-        raise ValueError(f"action must be finite, got {array[tuple(where)]} at index {where}")
+        raise ValueError(f"{name} must be finite, got {array[tuple(where)]} at index {where}")
     return np.ascontiguousarray(array, dtype=np.float64)
 
 

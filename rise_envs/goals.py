@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rise_envs.actions import finite_action
+
 REWARD_TYPES = ("dense", "sparse")
 
 
@@ -42,6 +44,20 @@ def check_reward_type(reward_type: str) -> str:
     if reward_type not in REWARD_TYPES:
         raise ValueError(f"reward_type must be one of {REWARD_TYPES}, got {reward_type!r}")
     return reward_type
+
+
+def checked_placement(goal: Any, obstacle: Any, dim: int, n_obstacles: int) -> tuple[NDArray, NDArray]:
+    """A goal (D,) and true readings (N, 2D + 1) that are put into an environment, as arrays of their own.
+
+    Raises:
+        ValueError: wrong shapes, numbers that are not finite, or a radius that is not positive.
+    """
+    width = 2 * dim + 1
+    place = finite_action(goal, (dim,), "goal").copy()
+    balls = finite_action(obstacle, (n_obstacles * width,), "obstacle").reshape(-1, width).copy()
+    if not (balls[:, -1] > 0).all():
+        raise ValueError(f"radii of obstacles must be positive, got {balls[:, -1].tolist()}")
+    return place, balls
 
 
 def reward(

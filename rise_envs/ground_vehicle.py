@@ -216,6 +216,21 @@ class GroundVehicleEnv(VehicleTask, gym.Env):
         self._now = np.concatenate(parts, dtype=np.float64)
         self._key, self._time = int(world.key[0]), int(world.step[0])
 
+    def place(self, goal: Any, obstacle: Any) -> None:
+        """Put goal and discs where somebody else has them: virtual obstacles that another process moves.
+
+        Args:
+            goal: (2,), m.
+            obstacle: the true reading, (5 · n_obstacles,); it holds for the coming step.
+
+        Raises:
+            ValueError: wrong shapes, numbers that are not finite, or a radius that is not positive. Nothing has
+                changed then.
+        """
+        now = self._started()
+        goal, discs = goals.checked_placement(goal, obstacle, 2, self.n_obstacles)
+        now[3:5], now[5:] = goal, discs.ravel()
+
     def _started(self) -> Array:
         if self._now is None:
             raise gym.error.ResetNeeded("call reset() to start an episode")

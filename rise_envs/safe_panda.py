@@ -140,6 +140,23 @@ class SafePandaEnv(PandaTask, gym.Env):
         self._trail = [self._state[:3]]
         return self._observe(sphere), self._info(self._state[:3], reached=False)
 
+    def place(self, goal: Any, obstacle: Any) -> None:
+        """Put goal and sphere where somebody else has them: a virtual obstacle that another process moves.
+
+        Args:
+            goal: (3,), m.
+            obstacle: the true reading, (7,); it holds for the coming step.
+
+        Raises:
+            ValueError: wrong shapes, numbers that are not finite, or a radius that is not positive. Nothing has
+                changed then.
+        """
+        sim, _ = self._open_sim(), self._started()
+        self._goal, self._sphere = goals.checked_placement(goal, obstacle, 3, 1)
+        self._there = self._goal.tolist()
+        self._away = goals.gap(sim.hand, self._there)
+        self._nearest = sim.clearance(self._sphere[0, :3], float(self._sphere[0, 6]))
+
     def step(self, action: Any) -> tuple[dict[str, Array], float, bool, bool, dict[str, Any]]:
         """Move the arm and the sphere for one step.
 
