@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -190,6 +191,49 @@ def test_a_state_that_is_not_finite():
     loop = make(clock, robot=robot)
     loop.run(3 * T)
     assert loop.watchdog.stopped.kind == "state" and not robot.times("apply")
+
+
+class Odd(Readings):
+    """Readings one of which is odd."""
+
+    def __init__(self, clock, odd):
+        super().__init__(clock, regular(clock))
+        self.odd = odd
+
+    def latest(self):
+        reading = super().latest()
+        return self.odd(reading) if reading.number == 4 else reading
+
+
+def no_answer(reading):
+    raise OSError("no answer")
+
+
+@pytest.mark.parametrize(
+    ("odd", "says"),
+    [
+        (lambda reading: replace(reading, stamp=np.nan), "reading: is stamped nan"),
+        (lambda reading: replace(reading, stamp=1e9), "reading: is stamped 1000000000.0"),
+        (lambda reading: replace(reading, stamp=-1e9), "stale: the last reading is"),
+        (lambda reading: None, "stale: no reading any more"),
+        (no_answer, "reading: OSError: no answer"),
+    ],
+)
+def test_streams_that_go_wrong_stop_the_robot_for_good(odd, says):
+    clock = Clock()
+    robot = Robot(clock)
+    loop = make(clock, robot=robot, readings=Odd(clock, odd))
+    loop.run(8 * T)
+    assert str(loop.watchdog.stopped).startswith(says) and len(robot.times("apply")) == 3
+    assert any(says in event for event in loop.recorder.log().events)
+
+
+def test_nobody_acts_on_what_has_become_stale_while_it_was_decided():
+    clock = Clock()
+    robot, works = Robot(clock), iter([0.0, 1.9 * T, *[0.0] * 9])
+    loop = make(clock, Policy(lambda: clock.work(next(works)) or (1.0, 0.0)), robot)
+    loop.run(8 * T)
+    assert loop.watchdog.stopped.kind == "stale" and len(robot.times("apply")) == 1
 
 
 @pytest.mark.parametrize("fails", ["observe", "apply", "write"])

@@ -142,15 +142,13 @@ class ControlLoop:
         """Wait for the next period; stop the robot at the moment that its last reading becomes stale."""
         while self.watchdog.stopped is None and not self._fatal:
             reading = self._read()
-            stale = self.clock.now() if reading is None else self.watchdog.stale_at(reading)
-            if stale >= deadline:
-                break
-            self.clock.wait(stale)
-            now = self.clock.now()
-            why = self.watchdog.judge(self._read(), now)
+            why = self.watchdog.judge(reading, self.clock.now())
             if why is not None:
-                self._stop(why)
-                self.recorder.amend(f"stop: {why}")
+                self._note_stop(why)
+            elif reading is not None and self.watchdog.stale_at(reading) < deadline:
+                self.clock.wait(self.watchdog.stale_at(reading))
+            else:
+                break
         self.clock.wait(deadline)
 
     def _period(self, k: int, start: float, deadline: float) -> None:
@@ -159,8 +157,8 @@ class ControlLoop:
         try:
             observed = self.robot.observe()
         except Exception as error:  # whatever a driver raises: there is nothing to act on
-            self._fail(Stop("robot", _line(error)))
-            self.recorder.amend(f"stop: {self.watchdog.stopped}")
+            self._fatal = True
+            self._note_stop(Stop("robot", _line(error)))
             return
         reading, now = self._read(), self.clock.now()
         self._fresh |= observed.begins
@@ -173,7 +171,7 @@ class ControlLoop:
         if why is None and reading is not None and self.watchdog.stopped is None:
             wanted, why = self._decide(observed, reading)
         if why is not None and self._stop(why):
-            events.append(f"stop: {why}")
+            events.append(f"stop: {self.watchdog.stopped}")
         action = self._command(wanted, events)
         ended = self.clock.now()
         late = ended > deadline + self.period
@@ -181,13 +179,17 @@ class ControlLoop:
         if late:
             events.append("overrun")
         if why is not None and self._stop(why):
-            events.append(f"stop: {why}")
+            events.append(f"stop: {self.watchdog.stopped}")
         times = Times(k, begun - start, deadline - start, ended - begun, now)
         fresh = fresh and wanted is not None
         self.recorder.add(times, observed, reading, wanted, action, fresh, events)
 
     def _read(self) -> Reading | None:
-        return self.stream.latest()
+        try:
+            return self.stream.latest()
+        except Exception as error:  # whatever a sensor's driver raises: it is as good as no reading
+            self._note_stop(Stop("reading", _line(error)))
+            return None
 
     def _decide(self, observed: Observed, reading: Reading) -> tuple[NDArray | None, Stop | None]:
         """What the policy wants, or what is wrong with it."""
@@ -200,7 +202,8 @@ class ControlLoop:
         except Exception as error:  # whatever a policy raises: the robot must stand
             return None, Stop("policy", _line(error))
         self._fresh = False
-        why = self.limits.check(wanted)
+        # What took long was decided on a reading that may be too old by now.
+        why = self.limits.check(wanted) or self.watchdog.judge(reading, self.clock.now())
         return (None, why) if why else (wanted, None)
 
     def _command(self, wanted: NDArray | None, events: list[str]) -> NDArray[np.float32]:
@@ -212,9 +215,9 @@ class ControlLoop:
         try:
             self.robot.apply(action)
         except Exception as error:  # whatever a driver raises
-            why = Stop("robot", _line(error))
+            self._fatal, why = True, Stop("robot", _line(error))
             events.append(f"stop: {why}")
-            self._fail(why)
+            self._stop(why)
             return self._last
         self._last = action
         return action
@@ -233,9 +236,10 @@ class ControlLoop:
             self._fatal = True
             self.watchdog.stop(Stop("robot", _line(error)))
 
-    def _fail(self, why: Stop) -> None:
-        self._fatal = True
-        self._stop(why)
+    def _note_stop(self, why: Stop) -> None:
+        """Stop between periods."""
+        if self._stop(why) or self._fatal:
+            self.recorder.amend(f"stop: {self.watchdog.stopped}")
 
 
 @contextmanager

@@ -84,6 +84,8 @@ class Watchdog:
         """What is wrong with the latest reading."""
         if reading is None:
             return Stop(WAITING, "no reading yet")
+        if not reading.stamp <= now + self.period:  # NaN is no time either
+            return Stop("reading", f"is stamped {reading.stamp}, now it is {now}")
         if now >= self.stale_at(reading):
             return Stop("stale", f"the last reading is {(now - reading.stamp) / self.period:.2f} periods old")
         parts = (reading.obstacle,) if reading.goal is None else (reading.obstacle, reading.goal)
@@ -103,6 +105,8 @@ class Watchdog:
     def stop(self, why: Stop) -> bool:
         """Stop; whether it went before. The first reason stays, but for a robot that fails."""
         went = self.stopped is None
+        if went and why.kind == WAITING:  # there was one
+            why = Stop("stale", "no reading any more")
         if went or why.kind == "robot":
             self.stopped = why
         self._good_since = None
