@@ -24,6 +24,7 @@ from rise_agents.agent import Progress, acting_settings, config_to_dict, make_co
 from rise_agents.demonstrations import recording
 from rise_agents.resume import Resume
 from rise_agents.rollout import rollout
+from rise_envs.task import describes_task, env_class
 
 _Actor = tuple[list[Any], dict[str, Any]]  # see _actor
 PARTS = "parts"  # folder for the pieces of demonstrations that are being recorded
@@ -208,7 +209,7 @@ def video_jobs(plan: Plan, out: Path) -> list[Job]:
     for env in plan.envs:
         asked = plan.described()[0]["rows"]
         for row, seed in plan.rows(env):
-            if seed or row not in asked:
+            if seed or row not in asked or "rgb_array" not in env_class(env).metadata["render_modes"]:
                 continue
             level = 0.0 if split_row(row)[1] == TRUE else headline
             source, arguments = _actor(plan, env, row, 0, out)
@@ -236,7 +237,9 @@ def check_settings(plan: Plan) -> None:
         for row, seed in plan.rows(env):
             if seed == 0 and plan.agent_of(row):
                 try:
-                    complete_settings(plan, env, row)
+                    settings = complete_settings(plan, env, row)
+                    if not describes_task(env):  # an agent says itself whether it can do without
+                        make_agent(plan.agent_of(row), env, settings)
                 except (TypeError, ValueError, checkpoint.CheckpointError) as error:
                     raise ValueError(f"settings of {split_row(row)[0]}: {error}") from None
 

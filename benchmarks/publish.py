@@ -101,6 +101,7 @@ def _without_folders(value: Any) -> Any:
 def parser() -> Parser:
     """The command line."""
     p = Parser(
+        plugins=True,
         prog="python -m benchmarks.publish",
         description="Turn a finished run into what is committed of it: episodes in few bytes, tables, figures, page.",
         epilog=_EXAMPLES,

@@ -355,6 +355,7 @@ def _block(entry: Mapping[str, Any]) -> dict[str, Any]:
 def parser() -> Parser:
     """The command line."""
     p = Parser(
+        plugins=True,
         prog="python -m benchmarks.report",
         description="Make the tables, the figures and the page of a run again, from its episodes.",
         epilog=_EXAMPLES,

@@ -39,6 +39,7 @@ A run that was stopped continues where it was: give the same command again.
 def parser() -> Parser:
     """The command line."""
     p = Parser(
+        plugins=True,
         prog="python -m benchmarks.run",
         description="Compare agents on noisy obstacle readings: train, evaluate, tables, figures, videos.",
         epilog=_EXAMPLES,

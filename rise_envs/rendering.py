@@ -209,7 +209,11 @@ def _font() -> pygame.font.Font:
 
 def _write(canvas: Canvas, text: str, x: float, colour: Colour) -> float:
     """Write into the strip from ``x`` (px); returns where the text ends."""
-    line = _font().render(text, True, colour)
+    try:
+        line = _font().render(text, True, colour)
+    except pygame.error:  # somebody else, another environment say, has called pygame.quit() since
+        _font.cache_clear()
+        line = _font().render(text, True, colour)
     canvas.surface.blit(line, (x, SMOOTH * (SIZE + STRIP / 2) - line.get_height() / 2))
     return x + line.get_width()
 

@@ -73,7 +73,7 @@ PROGRAMS = (
 # option -> texts that it must refuse
 _TEXTS: dict[str, tuple[str, ...]] = {
     "--agents": NAMES, "--envs": NAMES, "--env": NAMES, "--preset": NAMES, "--expert": NAMES, "--rows": NAMES,
-    "--filter": NAMES,
+    "--filter": NAMES, "--import": NAMES,
     "--noise-model": (*NAMES, "step+", "+step", "dropout:2", "dropout:x", "delay:-1", "step:1:2", "delay:nan"),
     "--device": (*NAMES, "cuda:99", "cpu:-1", "meta:x"),
     "--minari": ("", "x", "a/b", "a b/c-v0", "/", "../x-v0", "x-v", "x" * 300 + "-v0x", "\x00", "a\nb"),

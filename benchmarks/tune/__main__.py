@@ -30,6 +30,7 @@ A search that was stopped continues where it was: give the same command again.
 def parser() -> Parser:
     """The command line."""
     p = Parser(
+        plugins=True,
         prog="python -m benchmarks.tune",
         description="Search settings, with the same budget for each agent, on validation scenarios.",
         epilog=_EXAMPLES,
