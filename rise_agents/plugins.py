@@ -81,7 +81,9 @@ def _import(name: str, told: str) -> ModuleType:
         return importlib.import_module(name)
     except (Exception, SystemExit) as error:
         if isinstance(error, ModuleNotFoundError) and error.name == name.partition(".")[0]:
-            raise ValueError(f"--import {told}: there is no such module here; a file needs its .py") from None
+            raise ValueError(
+                f"--import {told[:200]}: there is no such module here; a file needs its .py"
+            ) from None
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         steps = [
             step for step in traceback.extract_tb(error.__traceback__) if "importlib" not in step.filename

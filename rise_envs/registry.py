@@ -62,7 +62,9 @@ def checked_entry(kind: str, entry: Any, needs: Iterable[str] = ()) -> tuple[Any
         raise ValueError(f"{kind}: {text!r} is no class")
     # An abstract method is there, and is not.
     abstract: frozenset[str] = getattr(found, "__abstractmethods__", frozenset())
-    missing = [name for name in needs if not hasattr(found, name) or name in abstract]
+    # Looked up in the class and its bases: every class can itself be called, whatever its instances can.
+    there = {name for base in found.__mro__ for name in vars(base)} - abstract
+    missing = [name for name in needs if name not in there]
     missing += sorted(abstract - set(missing))
     if missing:
         raise ValueError(f"{kind}: {text!r} lacks {', '.join(missing)}")
