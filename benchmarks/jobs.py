@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from benchmarks.labels import TRUE, agent_label, split_row
 from benchmarks.policies import make_policy
 from benchmarks.protocol import Plan, Scenarios, digest, imitates
 from benchmarks.videos import record
-from rise_agents import __version__, agent_class, checkpoint, demonstrations, make_agent, pretrained
+from rise_agents import __version__, agent_class, checkpoint, demonstrations, figures, make_agent, pretrained
 from rise_agents.agent import Progress, acting_settings, config_to_dict, make_config
 from rise_agents.demonstrations import recording
 from rise_agents.resume import Resume
@@ -146,6 +146,18 @@ def training_jobs(plan: Plan, out: Path, device: str, every: float) -> list[Job]
     return list(jobs.values())
 
 
+def with_events(jobs: Sequence[Job], folder: Path | None) -> list[Job]:
+    """The same jobs, trainings among them writing event files: into ``folder``, one folder in it each; None: none."""
+    if folder is None:
+        return list(jobs)
+
+    def told(job: Job) -> Job:
+        events = folder / job.arguments["env"] / job.output.stem
+        return replace(job, arguments={**job.arguments, "events": events})
+
+    return [told(job) if job.run is train else job for job in jobs]
+
+
 def tidy(out: Path) -> None:
     """Remove what a kill in the last lines of a job left: states of finished trainings, pieces of finished sets."""
     for state in out.glob("agents/*/*.training"):
@@ -265,11 +277,16 @@ def train(
     data: Path | None,
     device: str,
     every: float,
+    events: Path | None = None,
 ) -> None:
-    """Train one agent, from where it was interrupted; writes its checkpoint and a JSON record of the training."""
+    """Train one agent, from where it was interrupted; writes its checkpoint and a JSON record of the training.
+
+    With ``events``, its figures also go to event files in that folder, see :mod:`rise_agents.figures`.
+    """
     resume = Resume(output.with_suffix(".training"), every)
     learner = make_agent(agent, env, config, seed, device)
-    learner.learn(env if data is None else demonstrations.load(data), progress, resume)
+    with figures.written(events, resume, progress) as tell:
+        learner.learn(env if data is None else demonstrations.load(data), tell, resume)
     record = {"seconds": round(resume.seconds, 1), "device": device, "curve": resume.curve}
     results.atomic_write_text(output.with_suffix(".json"), json.dumps(record) + "\n")
     learner.save(output)

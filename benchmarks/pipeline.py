@@ -22,6 +22,7 @@ from benchmarks.jobs import (
     tidy,
     training_jobs,
     video_jobs,
+    with_events,
 )
 from benchmarks.labels import name_rows, split_row
 from benchmarks.protocol import Plan, imitates
@@ -40,6 +41,7 @@ class How:
         videos: whether to draw clips.
         every: seconds between two checkpoints of a training.
         command: how this run was started, for ``run.json``.
+        tensorboard: folder for event files of the trainings; None: none are written.
     """
 
     workers: int
@@ -47,6 +49,7 @@ class How:
     videos: bool = True
     every: float = 15.0
     command: tuple[str, ...] = ()
+    tensorboard: Path | None = None
 
 
 def execute(plan: Plan, out: Path, how: How) -> list[Failure]:
@@ -64,7 +67,7 @@ def execute(plan: Plan, out: Path, how: How) -> list[Failure]:
         jobs = [*recording_jobs(plan, out), *training_jobs(plan, out, how.device, how.every), *evaluations]
         jobs += video_jobs(plan, out) if how.videos else []
         display.plan(jobs)
-        failures = run_jobs(jobs, how.workers, display.watch, display.say)
+        failures = run_jobs(with_events(jobs, how.tensorboard), how.workers, display.watch, display.say)
     _write_failures(out / "failures.log", failures)
     _write_run(plan, out, how, failures)
     _write_results(out, evaluations)

@@ -122,6 +122,12 @@ def parser() -> Parser:
         metavar="S",
         help="seconds between two checkpoints of a training, from which it goes on if interrupted (default: 15)",
     )
+    p.add_argument(
+        "--tensorboard",
+        type=Path,
+        metavar="DIR",
+        help="write the figures of every training there as event files, which TensorBoard draws",
+    )
     p.add_argument("--no-videos", action="store_true", help="skip the clips")
     p.add_argument("--out", type=Path, metavar="DIR", help="run folder (default: runs/PRESET)")
     return p  # fmt: skip
@@ -157,6 +163,8 @@ def plan_of(arguments: argparse.Namespace) -> Plan:
         raise ValueError(f"--checkpoint-every must not be negative, got {arguments.checkpoint_every}")
     if arguments.pretrained and (arguments.seeds or arguments.demos):
         raise ValueError("--pretrained trains nobody: leave out --seeds and --demos")
+    if arguments.tensorboard is not None:
+        prepare_events(arguments.tensorboard)
     reported = [env for env in ENVS if env not in STAND_INS]
     plan = make_plan(
         arguments.preset,
@@ -177,6 +185,14 @@ def plan_of(arguments: argparse.Namespace) -> Plan:
     check_settings(plan)
     _check_device(arguments.device)
     return plan
+
+
+def prepare_events(folder: Path) -> None:
+    """Raise ``ValueError`` unless event files can be written to a folder."""
+    from rise_agents.figures import check_installed
+
+    check_installed()
+    prepare_folder(folder)
 
 
 def _rows(arguments: argparse.Namespace) -> tuple[str, ...] | None:
@@ -241,6 +257,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             videos=not arguments.no_videos,
             every=arguments.checkpoint_every,
             command=command,
+            tensorboard=arguments.tensorboard,
         )
         with sole_user(out):
             failures = execute(plan, out, how)

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from benchmarks.run import parse_settings
+from benchmarks.run import parse_settings, prepare_events
 from rise_agents import AGENTS
 from rise_agents.cli import Parser, prepare_folder
 
@@ -108,6 +108,12 @@ def parser() -> Parser:
         help="seconds between two checkpoints of a training, from which it goes on if interrupted (default: 15)",
     )
     p.add_argument(
+        "--tensorboard",
+        type=Path,
+        metavar="DIR",
+        help="write the figures of every training there as event files, which TensorBoard draws",
+    )
+    p.add_argument(
         "--write", type=Path, metavar="FILE", help="settings file that the chosen settings go into, too"
     )
     p.add_argument(
@@ -148,6 +154,8 @@ def search_of(a: argparse.Namespace) -> Search:
         search.study(agent, env)
     if a.write is not None:
         settings_file.read(a.write)
+    if a.tensorboard is not None:
+        prepare_events(a.tensorboard)
     return search
 
 
@@ -176,7 +184,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         from rise_agents.files import sole_user
         from rise_agents.workers import available_cores
 
-        how = How(a.workers or available_cores(), a.checkpoint_every, command, a.write)
+        how = How(a.workers or available_cores(), a.checkpoint_every, command, a.write, a.tensorboard)
         with sole_user(a.out):
             failures = execute(search, sets, a.out, how)
     except KeyboardInterrupt:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from benchmarks.display import Display
 from benchmarks.executors import Failure, run_jobs
-from benchmarks.jobs import Job, demonstrations_folder, recording_jobs, tidy
+from benchmarks.jobs import Job, demonstrations_folder, recording_jobs, tidy, with_events
 from benchmarks.protocol import Plan, imitates
 from benchmarks.tune import report
 from benchmarks.tune.ranking import Rates, best_clean, finalists, mean, ranked
@@ -78,12 +78,14 @@ class How:
         every: seconds between two checkpoints of a training.
         command: how it was started, for the comments of settings files.
         write: a settings file that the chosen settings go into, beside the one in the folder.
+        tensorboard: folder for event files of the trainings; None: none are written.
     """
 
     workers: int
     every: float
     command: tuple[str, ...]
     write: Path | None = None
+    tensorboard: Path | None = None
 
 
 def given_sets(search: Search) -> dict[str, tuple[Path, str]]:
@@ -198,7 +200,7 @@ def _jobs(trials: Mapping[Study, Iterable[int]], seeds: Iterable[int], out: Path
 def _run(jobs: Sequence[Job], how: How, kinds: str) -> list[Failure]:
     with Display() as display:
         display.plan(jobs, kinds)
-        return run_jobs(jobs, how.workers, display.watch, display.say)
+        return run_jobs(with_events(jobs, how.tensorboard), how.workers, display.watch, display.say)
 
 
 def _measured(study: Study, trials: Iterable[int], seeds: Iterable[int], out: Path) -> dict[int, Rates]:
