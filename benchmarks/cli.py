@@ -30,6 +30,7 @@ COMMANDS = {
     "report": Command("benchmarks.report", "make tables and figures again, from the episodes of a run"),
     "publish": Command("benchmarks.publish", "make what is committed of a run, or check it"),
     "demonstrations": Command("rise_agents.demonstrations.__main__", "record an expert's episodes"),
+    "play": Command("rise_agents.play", "drive with the keyboard, keep it as demonstrations"),
     "pretrained": Command("rise_agents.pretrained.__main__", "ship the trained agents of a run by name"),
     "speed": Command("benchmarks.speed.__main__", "measure speed against the peers"),
     "fidelity": Command("benchmarks.fidelity.__main__", "measure the kinematic arm against Bullet's"),

@@ -20,7 +20,7 @@ from benchmarks import publish, report
 from benchmarks import run as benchmark
 from benchmarks.results import read_rows
 from benchmarks.tune import __main__ as tune
-from rise_agents import AGENTS, make_agent, register_agent
+from rise_agents import AGENTS, make_agent, play, register_agent
 from rise_agents.demonstrations import __main__ as demonstrations
 from rise_agents.demonstrations import generate
 from rise_agents.experts import make_expert, register_expert
@@ -281,13 +281,15 @@ PROGRAMS = {
     "benchmarks.publish": publish,
     "rise_agents.demonstrations": demonstrations,
     "rise_agents.pretrained": pretrained,
+    "rise_agents.play": play,
 }
 
 
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_every_command_that_looks_names_up_imports(name, tmp_path, capsys):
     required = {"rise_agents.demonstrations": ["--env", "x", "--out", str(tmp_path)]}.get(name, [])
-    positional = [] if required or name in ("benchmarks.run", "benchmarks.tune") else [str(tmp_path)]
+    first = VEHICLE if name == "rise_agents.play" else str(tmp_path)
+    positional = [] if required or name in ("benchmarks.run", "benchmarks.tune") else [first]
     module = str(EXAMPLES / "neighbours.py")
     PROGRAMS[name].parser().parse_args([*positional, *required, "--import", module, "--import", "json"])
     assert "neighbours" in AGENTS
@@ -451,12 +453,12 @@ def test_commands_of_the_page_are_accepted(command, monkeypatch, tmp_path):
         benchmark.plan_of(benchmark.parser().parse_args(arguments))
     else:
         arguments[arguments.index("--out") + 1] = str(tmp_path)
-        {"rise_agents.demonstrations": demonstrations}[name].checked(arguments)
+        {"rise_agents.demonstrations": demonstrations, "rise_agents.play": play}[name].checked(arguments)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "command", [command for command in COMMANDS if runs(command)[0]]
+    "command", [command for command in COMMANDS if runs(command)[0] and ".play" not in command]
 )
 def test_commands_of_the_page_do_their_work(command, tmp_path):
     name, arguments = runs(command)
