@@ -218,3 +218,16 @@ def test_without_a_screen(monkeypatch, capsys):
     monkeypatch.setattr(pygame.display, "set_mode", none)
     assert main([VEHICLE]) == 1
     assert capsys.readouterr().err == "rise_agents.play: No available video device\n"
+
+
+def test_the_keys_of_the_arm_are_as_the_camera_sees_it():
+    """Right is right in the picture, down is towards the viewer, W is up."""
+    from rise_envs.panda_rendering import camera
+
+    hand, pairs = np.array([0.0, 0.0, 0.2]), env_class("RISE-SafePanda-v0").KEYS
+    towards = {"right": (1, 0), "left": (-1, 0), "down": (0, 1), "up": (0, -1), "w": (0, -1), "s": (0, 1)}
+    for axis, keys in enumerate(pairs):
+        for key, sign in zip(keys, (1, -1), strict=True):
+            moved = hand + 0.05 * sign * np.eye(3)[axis]
+            shift = camera().project(moved)[0] - camera().project(hand)[0]
+            assert shift @ towards[key] > 0.5 * np.abs(shift).max()
