@@ -10,6 +10,7 @@ import pytest
 
 from benchmarks import run as benchmark
 from benchmarks.jobs import Job, evaluate, train, with_events
+from benchmarks.tune import search
 from rise_agents import figures
 from rise_agents.agent import silent
 from rise_agents.resume import Resume
@@ -106,6 +107,14 @@ def test_only_trainings_write(tmp_path):
     assert first.arguments["events"] == tmp_path / "events" / VEHICLE / "rise-seed0-abc"
     assert second == jobs[1]
     assert with_events(jobs, None) == jobs
+
+
+def test_trainings_of_a_search_write_too(tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr(search, "run_jobs", lambda jobs, *rest: seen.extend(jobs) or [])
+    how = search.How(1, 15.0, (), tensorboard=tmp_path / "events")
+    search._run([Job("a", train, {"env": VEHICLE}, tmp_path / "x.rise")], how, "train")
+    assert [job.arguments["events"] for job in seen] == [tmp_path / "events" / VEHICLE / "x"]
 
 
 def test_a_run_writes_the_curve_of_every_training(tmp_path, tensorboard):
