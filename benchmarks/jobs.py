@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -143,6 +143,21 @@ def training_jobs(plan: Plan, out: Path, device: str, every: float) -> list[Job]
             needs = (folder / demonstrations.DATA,) if clones else ()
             jobs.setdefault(output, Job(name, train, arguments, output, needs, 10.0 if clones else 100.0))
     return list(jobs.values())
+
+
+def wanted(jobs: Sequence[Job], ends: Sequence[Job]) -> list[Job]:
+    """Those of ``jobs`` that are done, that are ``ends``, or whose output a missing end needs, directly or not.
+
+    Who measures needs no training whose episodes are all there, and no demonstrations for a training that is done.
+    """
+    by_output = {job.output: job for job in jobs}
+    asked = {job.output for job in ends}
+    open_ends = [job for job in ends if not job.output.exists()]
+    while open_ends:
+        missing = {path for job in open_ends for path in job.needs if not path.exists()} - asked
+        asked |= missing
+        open_ends = [by_output[path] for path in missing if path in by_output]
+    return [job for job in jobs if job.output in asked or job.output.exists()]
 
 
 def tidy(out: Path) -> None:

@@ -22,6 +22,7 @@ from benchmarks.jobs import (
     tidy,
     training_jobs,
     video_jobs,
+    wanted,
 )
 from benchmarks.labels import name_rows, split_row
 from benchmarks.protocol import Plan, imitates
@@ -60,8 +61,9 @@ def execute(plan: Plan, out: Path, how: How) -> list[Failure]:
     name_rows({name: variant.label for name, variant in plan.variants.items() if variant.label})
     with Display() as display:
         evaluations = evaluation_jobs(plan, out)
-        jobs = [*recording_jobs(plan, out), *training_jobs(plan, out, how.device, how.every), *evaluations]
-        jobs += video_jobs(plan, out) if how.videos else []
+        ends = [*evaluations, *(video_jobs(plan, out) if how.videos else [])]
+        before = [*recording_jobs(plan, out), *training_jobs(plan, out, how.device, how.every)]
+        jobs = wanted([*before, *ends], ends)
         display.plan(jobs)
         failures = run_jobs(jobs, how.workers, display.watch, display.say)
     _write_failures(out / "failures.log", failures)

@@ -7,6 +7,7 @@ import pytest
 
 from benchmarks import results
 from benchmarks.jobs import (
+    Job,
     check_settings,
     checkpoint_path,
     demonstrations_folder,
@@ -17,6 +18,7 @@ from benchmarks.jobs import (
     train,
     training_jobs,
     video_jobs,
+    wanted,
 )
 from benchmarks.labels import TRUE, split_row
 from benchmarks.policies import make_policy
@@ -159,3 +161,34 @@ def test_clips_are_titled_with_the_row_s_label(tmp_path):
         job.arguments["row"]: job.arguments["label"] for job in video_jobs(plan("pcbc+kalman"), tmp_path)
     }
     assert labels == {"pcbc+kalman": "PC-BC behind a Kalman filter"}
+
+
+def test_only_what_a_missing_end_needs_is_wanted(tmp_path):
+    """Two trainings from one set of two pieces; one of the first's evaluations is missing, none of the second's."""
+
+    def job(name, *needs):
+        return Job(name, train, {}, tmp_path / name, tuple(tmp_path / each for each in needs))
+
+    before = [
+        job("piece 0"),
+        job("piece 1"),
+        job("set", "piece 0", "piece 1"),
+        job("a", "set"),
+        job("b", "set"),
+    ]
+    ends = [job("a at 0", "a"), job("a at 1", "a"), job("b at 0", "b"), job("again", "b at 0"), job("chance")]
+
+    def names():
+        return [each.name for each in wanted([*before, *ends], ends)]
+
+    assert names() == [each.name for each in [*before, *ends]]
+    for done in ("a at 0", "b at 0", "again", "chance"):
+        (tmp_path / done).touch()
+    assert names() == ["piece 0", "piece 1", "set", "a", *(each.name for each in ends)]
+    (tmp_path / "set").touch()  # whose pieces may be gone
+    assert names() == ["set", "a", *(each.name for each in ends)]
+    (tmp_path / "b").touch()  # is done, and stays in the list
+    (tmp_path / "a at 1").touch()
+    (tmp_path / "again").unlink()  # needs an end, which is there
+    assert names() == ["set", "b", *(each.name for each in ends)]
+    assert wanted(before, []) == [before[2], before[4]]
