@@ -65,6 +65,13 @@ def checkpoint_path(plan: Plan, env: str, row: str, seed: int, out: Path) -> Pat
     return out / "agents" / env / f"{agent}-seed{seed}-{mark}.rise"
 
 
+def checkpoint_name(plan: Plan, trained: Path, out: Path) -> str:
+    """A checkpoint as ``run.json`` names it."""
+    if plan.pretrained:
+        return f"{trained.name} of rise_agents.pretrained, SHA-256 {pretrained.sha256(trained)}"
+    return str(trained.relative_to(out))
+
+
 def complete_settings(plan: Plan, env: str, row: str) -> dict[str, Any]:
     """All settings of a row's agent, the plan's and its own defaults; of a shipped one those it was trained with.
 

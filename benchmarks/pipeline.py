@@ -9,11 +9,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks import report, results
+from benchmarks import published, report, results
 from benchmarks.display import Display
 from benchmarks.executors import Failure, run_jobs
 from benchmarks.jobs import (
     Job,
+    checkpoint_name,
     checkpoint_path,
     complete_settings,
     demonstrations_folder,
@@ -26,7 +27,8 @@ from benchmarks.jobs import (
 )
 from benchmarks.labels import name_rows, split_row
 from benchmarks.protocol import Plan, imitates
-from rise_agents import checkpoint, demonstrations, pretrained
+from benchmarks.published import Published
+from rise_agents import checkpoint, demonstrations
 from rise_agents.files import sweep
 
 
@@ -40,6 +42,7 @@ class How:
         videos: whether to draw clips.
         every: seconds between two checkpoints of a training.
         command: how this run was started, for ``run.json``.
+        source: published results from which episodes are taken instead of running them.
     """
 
     workers: int
@@ -47,6 +50,7 @@ class How:
     videos: bool = True
     every: float = 15.0
     command: tuple[str, ...] = ()
+    source: Published | None = None
 
 
 def execute(plan: Plan, out: Path, how: How) -> list[Failure]:
@@ -61,13 +65,16 @@ def execute(plan: Plan, out: Path, how: How) -> list[Failure]:
     name_rows({name: variant.label for name, variant in plan.variants.items() if variant.label})
     with Display() as display:
         evaluations = evaluation_jobs(plan, out)
+        found = published.matches(how.source, plan, out, evaluations) if how.source else []
+        if how.source:
+            display.say(published.take(how.source, found))
         ends = [*evaluations, *(video_jobs(plan, out) if how.videos else [])]
         before = [*recording_jobs(plan, out), *training_jobs(plan, out, how.device, how.every)]
         jobs = wanted([*before, *ends], ends)
         display.plan(jobs)
         failures = run_jobs(jobs, how.workers, display.watch, display.say)
     _write_failures(out / "failures.log", failures)
-    _write_run(plan, out, how, failures)
+    _write_run(plan, out, how, failures, how.source if found else None)
     _write_results(out, evaluations)
     return failures
 
@@ -112,29 +119,31 @@ def _trained(plan: Plan, out: Path) -> dict[str, dict[str, Any]]:
     return facts
 
 
-def _told(trained: Path, plan: Plan, out: Path) -> str:
-    """A checkpoint as ``run.json`` names it."""
-    if plan.pretrained:
-        return f"{trained.name} of rise_agents.pretrained, SHA-256 {pretrained.sha256(trained)}"
-    return str(trained.relative_to(out))
-
-
 def _trained_rows(plan: Plan, env: str) -> list[str]:
     """The rows of trained agents, each once; what stands before one (a filter) makes it no other agent."""
     bases = dict.fromkeys(split_row(row)[0] for row, _ in plan.rows(env))
     return [base for base in bases if plan.agent_of(base)]
 
 
-def _write_run(plan: Plan, out: Path, how: How, failures: list[Failure]) -> None:
-    """``run.json``: all that is needed to repeat the run."""
+def _cards(plan: Plan, out: Path, source: Published | None) -> dict[str, Any]:
+    """What is known of the demonstrations of each environment, recorded here or for what was published."""
     cards = {}
     for env in plan.envs:
-        recorded = () if plan.pretrained else dict.fromkeys((plan.expert, *plan.experts(env)))
-        for expert in recorded:
+        asked = () if plan.pretrained else dict.fromkeys((plan.expert, *plan.experts(env)))
+        for expert in asked:
             folder = demonstrations_folder(plan, env, out, expert)
+            card = None
             if all((folder / name).exists() for name in (demonstrations.DATA, demonstrations.CARD)):
                 card = json.loads((folder / demonstrations.CARD).read_text())
+            elif source and expert in plan.experts(env):
+                card = source.card(env, expert, plan.demos)
+            if card is not None:
                 cards[env if expert == plan.expert else f"{env} by {expert}"] = card
+    return cards
+
+
+def _write_run(plan: Plan, out: Path, how: How, failures: list[Failure], source: Published | None) -> None:
+    """``run.json``: all that is needed to repeat the run; ``source``: published results that are a part of it."""
     run = {
         "command": shlex.join(how.command),
         "plan": asdict(plan),
@@ -148,10 +157,10 @@ def _write_run(plan: Plan, out: Path, how: How, failures: list[Failure]) -> None
             {"job": f.job.name, "output": str(f.job.output.relative_to(out)), "reason": f.reason}
             for f in failures
         ],
-        "demonstrations": cards,
+        "demonstrations": _cards(plan, out, source),
         "agents": {
             env: {
-                f"{row}-seed{seed}": _told(checkpoint_path(plan, env, row, seed, out), plan, out)
+                f"{row}-seed{seed}": checkpoint_name(plan, checkpoint_path(plan, env, row, seed, out), out)
                 for row, seed in plan.rows(env)
                 if plan.agent_of(row)
             }
@@ -159,6 +168,7 @@ def _write_run(plan: Plan, out: Path, how: How, failures: list[Failure]) -> None
         },
         "rows": list(dict.fromkeys(row for env in plan.envs for row, _ in plan.rows(env))),
         "training": _trained(plan, out),
+        "taken_from": source.origin() if source else [],
         "versions": checkpoint.versions(),
         "python": platform.python_version(),
         "platform": platform.platform(),

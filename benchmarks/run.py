@@ -14,10 +14,13 @@ import time
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from benchmarks.protocol import PRESETS, Plan, make_plan, with_filters
 from rise_agents.cli import Parser, prepare_folder
+
+if TYPE_CHECKING:
+    from benchmarks.published import Published
 
 # Those of torch that can train. A name that is none of them is refused without importing torch.
 _DEVICES = ("cpu", "cuda", "hpu", "mps", "mtia", "xla", "xpu")
@@ -30,6 +33,8 @@ examples:
   python -m benchmarks.run --agents rise --set rise.beta=0.1 --out runs/beta-0.1
   python -m benchmarks.run --agents rise pcbc cppo --preset smoke     everything once, in a minute
   python -m benchmarks.run --agents rise pcbc cppo --pretrained       without training, the weights of the package
+  python -m benchmarks.run --agents rise mine --config mine.toml --preset paper --published docs/results --no-videos
+                                       what is published is taken from there: only what is new is trained and run
 
 A run that was stopped continues where it was: give the same command again.
 """
@@ -78,6 +83,14 @@ def parser() -> Parser:
         default=[],
         metavar="NAME",
         help="for every row a second one behind this filter, for instance kalman",
+    )
+    p.add_argument(
+        "--published",
+        type=Path,
+        metavar="DIR",
+        help="take the episodes of the same agents from published results, for instance docs/results, instead of"
+        " training and running them again; with --pretrained those of the same weights. Their clips need their"
+        " training: --no-videos skips both",
     )
     p.add_argument("--seeds", type=int, metavar="N", help="training seeds per agent")
     p.add_argument(
@@ -179,6 +192,18 @@ def plan_of(arguments: argparse.Namespace) -> Plan:
     return plan
 
 
+def _source(folder: Path | None, out: Path) -> Published | None:
+    """The published results in a folder; raises ``ValueError`` if there are none, or the run would write into them."""
+    if folder is None:
+        return None
+    from benchmarks.published import read
+
+    found = read(folder)
+    if folder.resolve() == out.resolve():
+        raise ValueError(f"--out is the folder of published results itself, {str(out)!r}: name another")
+    return found
+
+
 def _has_gpu_driver() -> bool:
     """Whether NVIDIA's or AMD's driver is there; torch calls both cuda."""
     for library in ("libcuda.so.1", "nvcuda.dll"):
@@ -215,6 +240,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         warnings.simplefilter("ignore", DeprecationWarning)  # of libraries; their users cannot act on them
         plan = plan_of(arguments)
         out = arguments.out or Path("runs") / arguments.preset
+        source = _source(arguments.published, out)
         prepare_folder(out)
     except ValueError as error:
         print(f"benchmarks.run: {error}", file=sys.stderr)
@@ -233,6 +259,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             videos=not arguments.no_videos,
             every=arguments.checkpoint_every,
             command=command,
+            source=source,
         )
         with sole_user(out):
             failures = execute(plan, out, how)

@@ -82,7 +82,7 @@ _TEXTS: dict[str, tuple[str, ...]] = {
     "--checkpoint-every": tuple(text for text in NO_NUMBER if text not in ("inf", "1e400")),
 }  # fmt: skip
 _WHOLE = ("--seeds", "--episodes", "--demos", "--workers", "--repeats", "--seed", "--only")
-_PATHS = ("--out", "--docs", "--config")
+_PATHS = ("--out", "--docs", "--config", "--published")
 
 Line = list[str]
 
