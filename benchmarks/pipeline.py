@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import platform
 import shlex
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from benchmarks import published, report, results
 from benchmarks.display import Display
-from benchmarks.executors import Failure, run_jobs
+from benchmarks.executors import Failure, never, run_jobs
 from benchmarks.jobs import (
     Job,
     checkpoint_name,
@@ -43,6 +44,7 @@ class How:
         every: seconds between two checkpoints of a training.
         command: how this run was started, for ``run.json``.
         source: published results from which episodes are taken instead of running them.
+        time_is_up: whether to interrupt what runs, and to start nothing more.
     """
 
     workers: int
@@ -51,14 +53,30 @@ class How:
     every: float = 15.0
     command: tuple[str, ...] = ()
     source: Published | None = None
+    time_is_up: Callable[[], bool] = never
 
 
-def execute(plan: Plan, out: Path, how: How) -> list[Failure]:
-    """Do all that the plan asks for and is not done yet, in the run folder ``out``.
+@dataclass(frozen=True)
+class Outcome:
+    """How a run ended; if not everything is done, tables and figures show what there is.
 
-    Returns:
-        What failed; tables and figures then show what there is.
+    Attributes:
+        failures: what failed.
+        left: the jobs that are not done, those that failed among them.
     """
+
+    failures: list[Failure]
+    left: list[Job]
+
+    @property
+    def stopped(self) -> bool:
+        """Whether time was up before everything had been tried."""
+        failed = {failure.job.output for failure in self.failures}
+        return any(job.output not in failed for job in self.left)
+
+
+def execute(plan: Plan, out: Path, how: How) -> Outcome:
+    """Do all that the plan asks for and is not done yet, in the run folder ``out``, as far as time allows."""
     for folder in [out, *(path for path in out.rglob("*") if path.is_dir())]:
         sweep(folder)
     tidy(out)
@@ -72,11 +90,13 @@ def execute(plan: Plan, out: Path, how: How) -> list[Failure]:
         before = [*recording_jobs(plan, out), *training_jobs(plan, out, how.device, how.every)]
         jobs = wanted([*before, *ends], ends)
         display.plan(jobs)
-        failures = run_jobs(jobs, how.workers, display.watch, display.say)
+        failures = run_jobs(jobs, how.workers, display.watch, display.say, how.time_is_up)
+    # Asked again: pieces of a set of demonstrations are gone, and not needed, as soon as it is put together.
+    outcome = Outcome(failures, [job for job in wanted(jobs, ends) if not job.output.exists()])
     _write_failures(out / "failures.log", failures)
-    _write_run(plan, out, how, failures, how.source if found else None)
+    _write_run(plan, out, how, outcome, how.source if found else None)
     _write_results(out, evaluations)
-    return failures
+    return outcome
 
 
 def _write_results(out: Path, evaluations: list[Job]) -> None:
@@ -142,7 +162,7 @@ def _cards(plan: Plan, out: Path, source: Published | None) -> dict[str, Any]:
     return cards
 
 
-def _write_run(plan: Plan, out: Path, how: How, failures: list[Failure], source: Published | None) -> None:
+def _write_run(plan: Plan, out: Path, how: How, outcome: Outcome, source: Published | None) -> None:
     """``run.json``: all that is needed to repeat the run; ``source``: published results that are a part of it."""
     run = {
         "command": shlex.join(how.command),
@@ -155,8 +175,9 @@ def _write_run(plan: Plan, out: Path, how: How, failures: list[Failure], source:
         "device": how.device,
         "failed": [
             {"job": f.job.name, "output": str(f.job.output.relative_to(out)), "reason": f.reason}
-            for f in failures
+            for f in outcome.failures
         ],
+        "unfinished": len(outcome.left),
         "demonstrations": _cards(plan, out, source),
         "agents": {
             env: {

@@ -9,17 +9,20 @@ from __future__ import annotations
 import argparse
 import ctypes
 import json
+import math
 import sys
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from benchmarks.labels import count
 from benchmarks.protocol import PRESETS, Plan, make_plan, with_filters
 from rise_agents.cli import Parser, prepare_folder
 
 if TYPE_CHECKING:
+    from benchmarks.pipeline import Outcome
     from benchmarks.published import Published
 
 # Those of torch that can train. A name that is none of them is refused without importing torch.
@@ -33,6 +36,7 @@ examples:
   python -m benchmarks.run --agents rise --set rise.beta=0.1 --out runs/beta-0.1
   python -m benchmarks.run --agents rise pcbc cppo --preset smoke     everything once, in a minute
   python -m benchmarks.run --agents rise pcbc cppo --pretrained       without training, the weights of the package
+  python -m benchmarks.run --preset paper --hours 11.5                stops in time where a job may take 12 hours
   python -m benchmarks.run --agents rise mine --config mine.toml --preset paper --published docs/results --no-videos
                                        what is published is taken from there: only what is new is trained and run
 
@@ -135,6 +139,13 @@ def parser() -> Parser:
         metavar="S",
         help="seconds between two checkpoints of a training, from which it goes on if interrupted (default: 15)",
     )
+    p.add_argument(
+        "--hours",
+        type=float,
+        metavar="H",
+        help="stop after so many hours: what runs is interrupted as by Ctrl-C, tables and figures show what there is,"
+        " and the same command goes on (default: when all is done)",
+    )
     p.add_argument("--no-videos", action="store_true", help="skip the clips")
     p.add_argument("--out", type=Path, metavar="DIR", help="run folder (default: runs/PRESET)")
     return p  # fmt: skip
@@ -168,6 +179,8 @@ def plan_of(arguments: argparse.Namespace) -> Plan:
         raise ValueError(f"--workers must be at least 1, got {arguments.workers}")
     if not arguments.checkpoint_every >= 0:
         raise ValueError(f"--checkpoint-every must not be negative, got {arguments.checkpoint_every}")
+    if arguments.hours is not None and not 0 < arguments.hours < math.inf:
+        raise ValueError(f"--hours must be a number above 0, got {arguments.hours:g}")
     if arguments.pretrained and (arguments.seeds or arguments.demos):
         raise ValueError("--pretrained trains nobody: leave out --seeds and --demos")
     reported = [env for env in ENVS if env not in STAND_INS]
@@ -232,8 +245,24 @@ def _check_device(device: str) -> None:
         raise ValueError(f"--device {device} cannot be used here: {reason}") from None
 
 
+def time_limit(
+    hours: float | None, started: float, clock: Callable[[], float] = time.perf_counter
+) -> Callable[[], bool]:
+    """What says whether ``hours`` have passed since ``started``, seconds of ``clock``; None: never."""
+    return lambda: hours is not None and clock() - started >= 3600 * hours
+
+
+def _told(outcome: Outcome, hours: float | None) -> list[str]:
+    """What was not done, a line each."""
+    lines = [f"failed: {failure.job.name}: {failure.reason}" for failure in outcome.failures]
+    if outcome.stopped:
+        left = f"{count([len(outcome.left)], 'job')} {'is' if len(outcome.left) == 1 else 'are'} left"
+        lines.append(f"stopped by --hours after {hours:g} h; {left}: give the same command again to go on")
+    return lines
+
+
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the benchmark; returns the exit code: 0 done, 1 something failed, 2 bad arguments, 130 interrupted."""
+    """Run the benchmark; returns the exit code: 0 done, 1 not all was done, 2 bad arguments, 130 interrupted."""
     started = time.perf_counter()
     try:
         arguments = parser().parse_args(argv)
@@ -260,9 +289,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             every=arguments.checkpoint_every,
             command=command,
             source=source,
+            time_is_up=time_limit(arguments.hours, started),
         )
         with sole_user(out):
-            failures = execute(plan, out, how)
+            outcome = execute(plan, out, how)
     except KeyboardInterrupt:
         print(
             "\nbenchmarks.run: interrupted; what is finished is kept, run the command again to go on",
@@ -272,10 +302,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (OSError, ValueError) as error:
         print(f"benchmarks.run: {error}", file=sys.stderr)
         return 1
-    for failure in failures:
-        print(f"benchmarks.run: failed: {failure.job.name}: {failure.reason}", file=sys.stderr)
-    print(f"{'Finished' if not failures else 'Stopped'} after {time.perf_counter() - started:.0f} s: {out}")
-    return 1 if failures else 0
+    lines = _told(outcome, arguments.hours)
+    for line in lines:
+        print(f"benchmarks.run: {line}", file=sys.stderr)
+    print(f"{'Stopped' if lines else 'Finished'} after {time.perf_counter() - started:.0f} s: {out}")
+    return 1 if lines else 0
 
 
 if __name__ == "__main__":
