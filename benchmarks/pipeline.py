@@ -103,6 +103,7 @@ def _write_results(out: Path, evaluations: list[Job]) -> None:
     """Everything that is computed from the rows of episodes."""
     parts = [job.output for job in evaluations if job.output.exists()]
     if not parts:
+        (out / report.EPISODES).unlink(missing_ok=True)  # of an earlier plan, which run.json no longer tells
         return
     rows = results.merge(parts, out / report.EPISODES)
     summary = report.publish(rows, report.read_run(out), out)

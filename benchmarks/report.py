@@ -102,7 +102,8 @@ def summary_markdown(summary: Sequence[SummaryRow], run: Mapping[str, Any]) -> s
         summary: rows of :func:`benchmarks.tables.summarise`.
         run: what is known of the run: ``command`` (how to repeat it); ``training`` (name → facts of its training,
             which may be mappings themselves, such as facts per environment); ``figures`` (relative path →
-            caption; pictures are shown, other files linked), by default :data:`FIGURES`.
+            caption; pictures are shown, other files linked), by default :data:`FIGURES`; ``unfinished``: how many
+            jobs were not done.
 
     Raises:
         ValueError: an empty summary.
@@ -110,7 +111,7 @@ def summary_markdown(summary: Sequence[SummaryRow], run: Mapping[str, Any]) -> s
     if not summary:
         raise ValueError("no results to report: the summary is empty")
     envs = list(dict.fromkeys(row.env for row in summary))
-    blocks = ["# Results", *claims(summary)]
+    blocks = ["# Results", *what_is_left(run), *claims(summary)]
     for path, caption in run.get("figures", FIGURES).items():
         blocks.append(f"{'!' if path.endswith('.png') else ''}[{caption}]({path})")
     blocks += ["## Tables", _MEANING + (_SEVERAL_SEEDS if several_seeds(summary) else _ONE_SEED)]
@@ -125,6 +126,15 @@ def summary_markdown(summary: Sequence[SummaryRow], run: Mapping[str, Any]) -> s
     if "command" in run:
         blocks += ["## How to repeat", f"```sh\n{run['command']}\n```"]
     return "\n\n".join(blocks) + "\n"
+
+
+def what_is_left(run: Mapping[str, Any]) -> list[str]:
+    """A sentence for pages of a run that is not finished; none for others."""
+    left = run.get("unfinished", 0)
+    if not left:
+        return []
+    pieces = f"{count([left], 'piece')} of work {'is' if left == 1 else 'are'} left"
+    return [f"**Not finished:** {pieces}, so rows can be missing, or have fewer episodes than others."]
 
 
 def claims(summary: Sequence[SummaryRow]) -> list[str]:
@@ -312,6 +322,7 @@ def read_run(folder: Path) -> dict[str, Any]:
             "rows": [str(name) for name in record.get("rows", record["plan"]["agents"])],
             "training": dict(record.get("training", {})),
             "labels": {name: str(each["label"]) for name, each in variants if each["label"]},
+            "unfinished": int(record.get("unfinished", 0)),
         }
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(f"{path} is not the record of a run ({type(error).__name__}: {error})") from None

@@ -399,3 +399,7 @@ def test_a_training_keeps_its_state_when_time_is_up(tmp_path):
     assert sorted(job.name.split()[0] for job in outcome.left) == ["evaluate", "evaluate", "train"]
     assert json.loads((tmp_path / "run.json").read_text())["unfinished"] == 3
     assert state() and not (tmp_path / "episodes.parquet").exists()
+    # Nor would there be those of an earlier plan, of which run.json no longer speaks.
+    (tmp_path / "episodes.parquet").write_bytes(b"")
+    execute(plan, tmp_path, How(1, videos=False, time_is_up=lambda: True))
+    assert not (tmp_path / "episodes.parquet").exists()
