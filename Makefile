@@ -6,10 +6,11 @@ STAMP   = $(VENV)/.installed
 ARGS   ?=
 RUN    ?= runs/paper
 
-.PHONY: bench results tune speed faults faults-quick coverage test test-slow smoke lint audit format clean help
+.PHONY: bench reproduce results tune speed faults faults-quick coverage test test-slow smoke lint audit format clean help
 
 help:
 	@echo "make bench      install, then demonstrations, training, 1,000 noisy scenarios, tables, figures, videos"
+	@echo "make reproduce  the results that are committed, from nothing: hours; stop it when you like, it goes on"
 	@echo "make results    publish the run in runs/paper (or RUN=...) into docs/results"
 	@echo "make tune       search settings, with the same budget for each agent, on validation scenarios"
 	@echo "make speed      speed against the peers, into docs/performance.md"
@@ -31,6 +32,9 @@ $(STAMP): pyproject.toml constraints.txt
 
 bench: $(STAMP)
 	$(BIN)/python -m benchmarks.run --agents rise pcbc cppo $(ARGS)
+
+reproduce: $(STAMP)
+	$(BIN)/python -m benchmarks.run --preset paper $(ARGS)
 
 results: $(STAMP)
 	$(BIN)/python -m benchmarks.publish $(RUN) $(ARGS)

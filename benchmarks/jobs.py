@@ -182,9 +182,9 @@ def evaluation_jobs(plan: Plan, out: Path) -> list[Job]:
     jobs = []
     for env in plan.envs:
         for row, seed in plan.rows(env):
-            actor = _actor(plan, env, row, seed, out)
+            actor, met = _actor(plan, env, row, seed, out), plan.conditions(env, row, seed)
             for part in plan.chunks(env):
-                first, *others = (_evaluation(plan, out, actor, seed, *c, part) for c in plan.conditions())
+                first, *others = (_evaluation(plan, out, actor, seed, *condition, part) for condition in met)
                 if split_row(row)[1] == TRUE:  # the same episodes under every condition: run once
                     others = [_repetition(job, first) for job in others]
                 jobs += [first, *others]
@@ -199,7 +199,7 @@ def _evaluation(
     arguments = {**who, "seed": seed, "noise_model": model, "noise_level": level, "scenarios": part}
     mark = digest(env, row, seed, *source, model, level, part.start, part.count)
     output = out / "parts" / env / f"{row}-seed{seed}-{model}{level:g}-{part.start}-{mark}.parquet"
-    under = f" ({model})" if len(set(plan.noise_models)) > 1 else ""
+    under = f" ({model})" if len({*plan.noise_models, model}) > 1 else ""
     name = f"evaluate {row} on {env} at noise {level:g}{under}"
     return Job(name, evaluate, arguments, output, _needed(arguments))
 
@@ -224,12 +224,13 @@ def _needed(arguments: dict[str, Any]) -> tuple[Path, ...]:
 
 
 def video_jobs(plan: Plan, out: Path) -> list[Job]:
-    """One clip for each row of the tables, of its first training seed, at the headline noise level."""
+    """One clip for each row that was asked for, of its first training seed, at the headline noise level."""
     headline, model = min(plan.noise_levels, key=lambda x: (abs(x - 1), x)), plan.noise_models[0]
     jobs = []
     for env in plan.envs:
+        asked = plan.described()[0]["rows"]
         for row, seed in plan.rows(env):
-            if seed:
+            if seed or row not in asked:
                 continue
             level = 0.0 if split_row(row)[1] == TRUE else headline
             source, arguments = _actor(plan, env, row, 0, out)

@@ -29,6 +29,7 @@ from benchmarks.jobs import (
 from benchmarks.labels import name_rows, split_row
 from benchmarks.protocol import Plan, imitates
 from benchmarks.published import Published
+from benchmarks.sections import sections
 from rise_agents import checkpoint, demonstrations
 from rise_agents.files import sweep
 
@@ -106,9 +107,12 @@ def _write_results(out: Path, evaluations: list[Job]) -> None:
         (out / report.EPISODES).unlink(missing_ok=True)  # of an earlier plan, which run.json no longer tells
         return
     rows = results.merge(parts, out / report.EPISODES)
-    summary = report.publish(rows, report.read_run(out), out)
-    for env in dict.fromkeys(row.env for row in summary):
-        print(report.summary_table_text(summary, env))
+    run = report.read_run(out)
+    asked, *others = sections(report.publish(rows, run, out), run.get("blocks", ()))
+    for env in dict.fromkeys(row.env for row in asked.rows):
+        print(report.summary_table_text(asked.rows, env))
+    if others:
+        print(f"{len(others)} more tables are in {out / 'summary.md'}\n")
 
 
 def _write_failures(path: Path, failures: list[Failure]) -> None:
@@ -189,6 +193,7 @@ def _write_run(plan: Plan, out: Path, how: How, outcome: Outcome, source: Publis
             for env in plan.envs
         },
         "rows": list(dict.fromkeys(row for env in plan.envs for row, _ in plan.rows(env))),
+        "blocks": plan.described(),
         "training": _trained(plan, out),
         "taken_from": source.origin() if source else [],
         "versions": checkpoint.versions(),

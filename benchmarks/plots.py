@@ -24,13 +24,18 @@ from benchmarks.labels import (
     percent,
     sample,
     several_seeds,
+    split_row,
 )
 from benchmarks.results import StrPath, atomic_write_bytes
-from benchmarks.tables import SummaryRow
+from benchmarks.sections import Section
+from benchmarks.tables import SummaryRow, headline_level
 
 # Okabe & Ito's colours, which colour-blind readers tell apart; greys are left to the reference rows.
-_COLOURS = {"rise": "#0072B2", "pcbc": "#E69F00", "cppo": "#009E73", "expert": "#7F7F7F", "random": "#BDBDBD"}
-_SPARE_COLOURS = ("#D55E00", "#CC79A7", "#56B4E9", "#7B5BA6", "#8C6D1F")
+_COLOURS = {
+    **{"rise": "#0072B2", "pcbc": "#E69F00", "cppo": "#009E73", "rise-belief": "#CC79A7"},
+    **{"expert": "#7F7F7F", "random": "#BDBDBD"},
+}
+_SPARE_COLOURS = ("#D55E00", "#56B4E9", "#7B5BA6", "#8C6D1F", "#A3423C")
 _MARKERS = "osD^vPX*<>"
 INK, FAINT, GRID = "#222222", "#6A6A6A", "#E6E6E6"
 _WIDTH = 10.0  # inches
@@ -84,10 +89,69 @@ def comparison(summary: Sequence[SummaryRow], level: float, noise_model: str | N
     for env, pair in zip(envs, axes, strict=True):
         of_env = {row.agent: row for row in shown if row.env == env}
         for axis, metric in zip(pair, METRICS, strict=True):
-            _draw_bars(axis, agents, {agent: metric.of(row) for agent, row in of_env.items()})
+            bars = {place: metric.of(of_env[agent]) for place, agent in enumerate(agents) if agent in of_env}
+            _draw_bars(axis, bars, [colour(agents, agent) for agent in agents])
+            axis.set_yticks(range(len(agents)), [agent_label(agent) for agent in agents])
             axis.set_xlabel(metric.meaning.replace("\n", " "))
         pair[1].tick_params(labelleft=False)
     return figure
+
+
+def grouped(sections: Sequence[Section]) -> Figure:
+    """Safety and Reach Rate of the rows of sections of one task, at the level of the figures: a group per section.
+
+    A section of several noise models has a group for each.
+
+    Raises:
+        ValueError: no sections.
+    """
+    groups = [group for section in sections for group in _groups(section)]
+    if not groups:
+        raise ValueError("there are no rows to draw")
+    shown = [row for _, rows in groups for row in rows]
+    # A place for the title of each group, one for each row, and one between groups.
+    places = [entry for title, rows in groups for entry in ("", title, *rows)][1:]
+    levels = sorted({row.noise_level for row in shown})
+    notes = [
+        f"Noise level {' or '.join(f'{level:g}' for level in levels)}",
+        sample(shown, "bar"),
+        _intervals(shown),
+    ]
+    title = "Controls, sweeps and other noise"
+    figure, (pair,) = _panels([shown[0].env], 0.75 + 0.25 * len(places), title, notes)
+    names = list(dict.fromkeys(_family(row) for row in shown))
+    colours = [colour(names, _family(entry)) if isinstance(entry, SummaryRow) else "" for entry in places]
+    words = [agent_label(entry.agent) if isinstance(entry, SummaryRow) else "" for entry in places]
+    for axis, metric in zip(pair, METRICS, strict=True):
+        rates = {place: metric.of(row) for place, row in enumerate(places) if isinstance(row, SummaryRow)}
+        _draw_bars(axis, rates, colours)
+        axis.set_yticks(range(len(places)), words)
+        axis.set_xlabel(metric.meaning.replace("\n", " "))
+    for place, entry in enumerate(places):
+        if isinstance(entry, str):
+            pair[0].text(1, place, entry, va="center", size=10.5, weight="bold", color=INK, in_layout=False)
+    pair[0].set_zorder(1)  # long titles reach over the other panel, where their lines are empty
+    pair[0].patch.set_visible(False)
+    pair[1].tick_params(labelleft=False)
+    return figure
+
+
+def _groups(section: Section) -> list[tuple[str, list[SummaryRow]]]:
+    """Title and rows of the groups of a section, at its headline level."""
+    noisy = [row for row in section.rows if row.noise_level] or section.rows
+    groups = []
+    for model in dict.fromkeys(row.noise_model for row in noisy):
+        of_model = [row for row in noisy if row.noise_model == model]
+        level = headline_level(of_model)
+        title = f"{section.title}: {noise_label(model)}" if model != "step" else section.title
+        groups.append((title, [row for row in of_model if row.noise_level == level]))
+    return groups
+
+
+def _family(row: SummaryRow) -> str:
+    """The agent whose variant a row is, as far as its name says: what its colour stands for."""
+    base = split_row(row.agent)[0]
+    return next((name for name in sorted(_COLOURS, key=len, reverse=True) if base.startswith(name)), base)
 
 
 def noise_curve(summary: Sequence[SummaryRow], noise_model: str | None = None) -> Figure:
@@ -206,20 +270,27 @@ def _panels(
     return figure, axes
 
 
-def _draw_bars(axis: Axes, agents: Sequence[str], rates: Mapping[str, Rate]) -> None:
-    """A horizontal bar per agent, top to bottom, its interval as a whisker and in figures beside it."""
-    for place, agent in enumerate(agents):
-        if agent not in rates:
+def _draw_bars(axis: Axes, rates: Mapping[int, Rate], colours: Sequence[str]) -> None:
+    """A horizontal bar per place, top to bottom, its interval as a whisker and in figures beside it.
+
+    Args:
+        axis: of the panel.
+        rates: by place; where one is missing nothing was run.
+        colours: of all places; a place of none is left empty.
+    """
+    for place, paint in enumerate(colours):
+        if not paint:
+            continue
+        if place not in rates:
             axis.text(1, place, "not run", va="center", size=10, color=FAINT, style="italic")
             continue
-        rate, low, high = rates[agent]
-        axis.barh(place, 100 * rate, height=0.66, color=colour(agents, agent))
+        rate, low, high = rates[place]
+        axis.barh(place, 100 * rate, height=0.66, color=paint)
         ends = [[100 * (rate - low)], [100 * (high - rate)]]
         axis.errorbar(100 * rate, place, xerr=ends, color=INK, elinewidth=1.4, capsize=3.5, capthick=1.4)
         _beside(axis, place, 48, f"{percent(rate)} %", size=11, weight="bold", color=INK)
         _beside(axis, place, 110, interval(low, high), size=9.5, color=FAINT)
-    axis.set(xlim=(0, 101.5), ylim=(len(agents) - 0.4, -0.6))
-    axis.set_yticks(range(len(agents)), [agent_label(agent) for agent in agents])
+    axis.set(xlim=(0, 101.5), ylim=(len(colours) - 0.4, -0.6))
     axis.tick_params(axis="y", length=0)
     axis.grid(axis="x", color=GRID)
 

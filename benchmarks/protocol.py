@@ -10,16 +10,17 @@ import hashlib
 import itertools
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 from benchmarks import configs
 from benchmarks.configs import Settings, Variant
 from benchmarks.labels import REFERENCES, TRUE, split_row
+from benchmarks.presets import PRESETS, Block, Preset
 from rise_agents import AGENTS, agent_class, pretrained
 from rise_agents.agent import nearest
-from rise_agents.experts import expert_names
+from rise_agents.experts import EXPERTS, expert_names
 from rise_agents.filters import FILTERS
 from rise_agents.rollout import is_batched_env
 from rise_agents.seeds import RUNS, episode_seeds
@@ -41,67 +42,13 @@ class Scenarios:
 
 
 @dataclass(frozen=True)
-class Preset:
-    """How much is trained and measured.
-
-    Attributes:
-        demos: episodes of demonstrations per environment.
-        episodes: test scenarios per condition.
-        noise_levels: multiples of the environment's noise scale.
-        seeds: training seeds.
-        clips: scenarios that a video shows.
-        settings: per agent or per ``agent@environment``, settings that differ from the agent's own.
-        tuned: whether the settings of ``benchmarks/configs/tuned.toml`` lie over these, if that is there.
-    """
-
-    demos: int
-    episodes: int
-    noise_levels: tuple[float, ...]
-    seeds: int
-    clips: int = 3
-    settings: Settings = field(default_factory=dict)
-    tuned: bool = False
-
-
-_BRIEF = {"updates": 300, "batch_size": 64}
-PRESETS = {
-    "smoke": Preset(
-        demos=24,
-        episodes=16,
-        noise_levels=(1.0,),
-        seeds=1,
-        clips=1,
-        settings={
-            "pcbc": _BRIEF,
-            "rise": {**_BRIEF, "vae_updates": 300, "vae_batch_size": 64},
-            "cppo": {"total_steps": 2_048},
-            # In the engine: what compiles the batched arm takes longer than this training.
-            "cppo@RISE-SafePanda-v0": {"train_env": "", "n_envs": 4, "n_steps": 128},
-        },
-    ),
-    "quick": Preset(demos=1_000, episodes=1_000, noise_levels=(0.0, 0.5, 1.0, 2.0), seeds=1),
-    "paper": Preset(
-        demos=10_000,
-        episodes=1_000,
-        noise_levels=(0.0, 0.25, 0.5, 1.0, 1.5, 2.0),
-        seeds=5,
-        settings={
-            "pcbc": {"updates": 60_000},
-            "rise": {"updates": 60_000, "vae_updates": 30_000},
-            "cppo": {"total_steps": 10_000_000},
-        },
-        tuned=True,
-    ),
-}
-
-
-@dataclass(frozen=True)
 class Plan:
     """One run of the benchmark, complete: what ``run.json`` stores and what every result follows from.
 
     Attributes:
-        agents: the rows that were asked for: agents, variants, ``expert`` (a row for each) and ``random``, alone or
-            behind a filter, as in ``pcbc+kalman``; ``+true`` stands for true readings at every level.
+        agents: the rows that were asked for: agents, variants, ``expert`` (a row for each), ``expert-NAME`` and
+            ``random``, alone or behind a filter, as in ``pcbc+kalman``; ``+true`` stands for true readings at every
+            level.
         envs: environments.
         demos: episodes of demonstrations per environment and expert.
         episodes: test scenarios per condition.
@@ -113,6 +60,7 @@ class Plan:
         settings: of agents and variants, or either with ``@environment``: what differs from the agents' own.
         variants: those among ``agents``.
         pretrained: nobody is trained: the agents are those that come with the package.
+        blocks: what is measured beside all this.
 
     Raises:
         ValueError: an unknown name (with the nearest known one) or a number out of range.
@@ -130,35 +78,48 @@ class Plan:
     settings: Settings = field(default_factory=dict)
     variants: dict[str, Variant] = field(default_factory=dict)
     pretrained: bool = False
+    blocks: tuple[Block, ...] = ()
 
     def __post_init__(self) -> None:
-        if not (self.agents and self.envs and self.noise_models and self.noise_levels):
-            raise ValueError("a run needs at least one agent, environment, noise model and noise level")
-        check_names(self.agents, self.settings, self.variants)
-        for env in self.envs:
+        for env in (*self.envs, *(env for block in self.blocks for env in block.envs)):
             _known("environment", env, ENVS)
         _known("expert", self.expert, sorted({name for env in ENVS for name in expert_names(env)}))
         _whole("episodes", self.episodes, 1, 1_000_000)
         _whole("demos", self.demos, 1, 500_000)
-        _whole("seeds", self.seeds, 1, RUNS)
-        for level in self.noise_levels:
+        for block in self.all_blocks():
+            self._check_block(block)
+        # Last: whether an agent imitates says its class, which takes a second to import.
+        for block in self.all_blocks():
+            for name in block.agents:
+                self._check_sources(name, block)
+
+    def _check_block(self, block: Block) -> None:
+        if not (block.agents and self.envs and block.noise_models and block.noise_levels):
+            raise ValueError("a run needs at least one agent, environment, noise model and noise level")
+        check_names(block.agents, self.settings, self.variants)
+        _whole("seeds", block.seeds, 1, RUNS)
+        for level in block.noise_levels:
             if not 0 <= level < float("inf"):
                 raise ValueError(f"noise levels must be finite and not negative, got {level}")
-        for model, env in itertools.product(self.noise_models, self.envs):
+        for model, env in itertools.product(block.noise_models, self._envs(block)):
             make_noise(model, groups=task_of(env).noise_channels)
-        if self.pretrained and self.seeds != 1:
+        if self.pretrained and block.seeds != 1:
             raise ValueError(
                 "agents that come with the package are trained: there is one training seed of each"
             )
-        for (
-            name
-        ) in self.agents:  # last: whether an agent imitates says its class, which takes a second to import
-            self._check_sources(name)
 
-    def _check_sources(self, name: str) -> None:
+    def all_blocks(self) -> tuple[Block, ...]:
+        """What is measured: the rows that were asked for, then :attr:`blocks` as far as they are of this run."""
+        own = Block("", self.agents, self.noise_models, self.noise_levels, self.seeds)
+        return own, *(block for block in self.blocks if self._envs(block))
+
+    def _envs(self, block: Block) -> list[str]:
+        return [env for env in self.envs if not block.envs or env in block.envs]
+
+    def _check_sources(self, name: str, block: Block) -> None:
         """Raise ``ValueError`` unless a row has an environment, and there what it learns from or consists of."""
         base, _ = split_row(name)
-        envs = [env for env in self.envs if self._takes_part(base, env)]
+        envs = [env for env in self._envs(block) if self._takes_part(base, env)]
         if not envs:
             theirs = ", ".join(self.variants[base].envs)
             raise ValueError(f"variant {base!r} is for {theirs} only, which is not among the environments")
@@ -167,6 +128,8 @@ class Plan:
                 self.shipped(base, env)
             elif base == "expert" or self.learns_from_expert(base):
                 _known("expert", self.expert_of(base), expert_names(env))
+            elif _single_expert(base):
+                _known("expert", _single_expert(base), expert_names(env))
 
     def _takes_part(self, base: str, env: str) -> bool:
         """Whether a row is run in an environment."""
@@ -210,16 +173,21 @@ class Plan:
 
     def rows(self, env: str) -> list[tuple[str, int]]:
         """(row name, training seed) of everything that is evaluated in an environment."""
+        return list(self._conditions(env))
+
+    def _rows(self, block: Block, env: str) -> list[tuple[str, int]]:
+        """Those of a block."""
         rows: list[tuple[str, int]] = []
-        for name in dict.fromkeys(self.agents):
+        for name in block.agents if env in self._envs(block) else ():
             base, filtered = split_row(name)
+            behind = f"+{filtered}" if filtered else ""
             if not self._takes_part(base, env):
                 continue
             if base == "expert":
-                behind = f"+{filtered}" if filtered else ""
                 rows += [(f"expert-{expert}{behind}", 0) for expert in expert_names(env)]
             else:
-                rows += [(name, seed) for seed in range(1 if base == "random" else self.seeds)]
+                untrained = base == "random" or _single_expert(base)
+                rows += [(name, seed) for seed in range(1 if untrained else block.seeds)]
         return rows
 
     def experts(self, env: str) -> list[str]:
@@ -227,11 +195,31 @@ class Plan:
         rows = [row for row, seed in self.rows(env) if seed == 0 and self.learns_from_expert(row)]
         return list(dict.fromkeys(self.expert_of(row) for row in rows))
 
-    def conditions(self) -> list[tuple[str, float]]:
-        """(noise model, noise level) of everything that is measured."""
+    def conditions(self, env: str, row: str, seed: int) -> list[tuple[str, float]]:
+        """(noise model, noise level) of everything that a row is measured under; level 0 is of the first model."""
+        return self._conditions(env)[row, seed]
+
+    def _conditions(self, env: str) -> dict[tuple[str, int], list[tuple[str, float]]]:
+        """The same for every row and training seed, in their order."""
         first = self.noise_models[0]
-        models = dict.fromkeys(self.noise_models)
-        return [(model, x) for model in models for x in self.noise_levels if x > 0 or model == first]
+        found: dict[tuple[str, int], dict[tuple[str, float], None]] = {}
+        for block in self.all_blocks():
+            met = {
+                (model if level else first, level): None
+                for model in block.noise_models
+                for level in block.noise_levels
+            }
+            for row in self._rows(block, env):
+                found.setdefault(row, {}).update(met)
+        return {row: list(met) for row, met in found.items()}
+
+    def described(self) -> list[dict[str, Any]]:
+        """What each block measures, its rows by their names in the tables; for :mod:`benchmarks.sections`."""
+        described = []
+        for block in self.all_blocks():
+            rows = dict.fromkeys(row for env in self.envs for row, _ in self._rows(block, env))
+            described.append({**asdict(block), "rows": list(rows)})
+        return described
 
     def chunks(self, env: str) -> list[Scenarios]:
         """The scenarios in the portions that jobs take: fixed, so that workers do not change results."""
@@ -243,7 +231,8 @@ def check_names(agents: Iterable[str], settings: Iterable[str], variants: Mappin
     """Raise ``ValueError`` unless rows and names of settings are of registered agents and of ``variants``."""
     for name in agents:
         base, filtered = split_row(name)
-        _known("agent", base, [*AGENTS, *REFERENCES, *variants])
+        experts = [f"expert-{expert}" for _, expert in EXPERTS] if base.startswith("expert-") else []
+        _known("agent", base, [*AGENTS, *REFERENCES, *variants, *experts])
         if filtered or name.endswith("+"):
             _known("filter", filtered, [*FILTERS, TRUE])
     for name in settings:
@@ -259,6 +248,11 @@ def with_filters(agents: Iterable[str], filters: Sequence[str]) -> tuple[str, ..
         alone = name != "random" and not split_row(name)[1]
         rows += [name, *(f"{name}+{each}" for each in filters if alone)]
     return tuple(dict.fromkeys(rows))
+
+
+def _single_expert(base: str) -> str:
+    """The expert that a row ``expert-NAME`` names; empty for others."""
+    return base.removeprefix("expert-") if base.startswith("expert-") else ""
 
 
 def imitates(agent: str) -> bool:
@@ -291,18 +285,28 @@ def make_plan(preset: str, settings: Settings, config_files: Sequence[Path] = ()
     if preset not in PRESETS:
         raise ValueError(f"unknown preset {preset!r}: {nearest(preset, PRESETS)}")
     base = PRESETS[preset]
-    values = {f.name: getattr(base, f.name) for f in fields(Preset) if f.name not in ("settings", "tuned")}
+    values = {f.name: getattr(base, f.name) for f in fields(Preset) if f.name not in ("brief", "tuned")}
     values.update({name: value for name, value in chosen.items() if value is not None})
     shipped = values.get("pretrained", False)  # whose settings are stored with their weights
     if shipped:
         values["seeds"] = chosen.get("seeds") or 1
+    if shipped or chosen.get("agents"):  # who names rows wants these alone
+        values["blocks"] = chosen.get("blocks") or ()
     read = configs.read(configs.files(base.tuned and not shipped, config_files))
-    check_names(values.get("agents", ()), settings, read.variants)
-    merged = configs.laid_over([{} if shipped else base.settings, *read.layers, settings])
-    named = {split_row(name)[0] for name in values.get("agents", ())}
+    names = [*values["agents"], *(name for block in values["blocks"] for name in block.agents)]
+    check_names(names, settings, read.variants)
+    named = dict.fromkeys(split_row(name)[0] for name in names)
+    brief = _brief(named, read.variants) if base.brief and not shipped else {}
+    merged = configs.laid_over([brief, *read.layers, settings])
     variants = {name: variant for name, variant in read.variants.items() if name in named}
     kept = {name: each for name, each in merged.items() if name.partition("@")[0] in (*AGENTS, *variants)}
     return Plan(**values, settings=kept, variants=variants)
+
+
+def _brief(rows: Iterable[str], variants: Mapping[str, Variant]) -> Settings:
+    """Settings with which the agents of rows train in a second or two."""
+    agents = (variants[row].agent if row in variants else row for row in rows)
+    return {agent: dict(agent_class(agent).BRIEF) for agent in agents if agent in AGENTS}
 
 
 def digest(*parts: Any) -> str:

@@ -46,8 +46,8 @@ def publish(run: Path, out: Path, partial: bool = False) -> None:
         raise ValueError(f"{str(run)!r} has no episodes yet: there is nothing to publish")
     rows = results.rounded(results.read_rows(run / report.EPISODES))
     prepare_folder(out)
-    for name in report.FIGURES:  # those of noise models that this run may not have
-        for old in out.glob(f"{Path(name).stem}*.png"):
+    for stem in (*(Path(name).stem for name in report.FIGURES), "others-"):  # this run may not have them all
+        for old in out.glob(f"{stem}*.png"):
             old.unlink()
     results.write_compact(out / report.EPISODES, rows)
     results.atomic_write_text(out / report.RECORD, json.dumps(record, indent=1, ensure_ascii=False) + "\n")

@@ -33,6 +33,7 @@ from benchmarks.labels import (
     several_seeds,
 )
 from benchmarks.results import atomic_write_text, read_rows
+from benchmarks.sections import Section, compared, sections
 from benchmarks.tables import ComparisonRow, SummaryRow, analyse, headline_level, write_table
 from rise_agents.cli import Parser, prepare_folder
 from rise_agents.files import sole_user
@@ -96,28 +97,30 @@ def summary_table_text(summary: Sequence[SummaryRow], env: str) -> str:
 
 
 def summary_markdown(summary: Sequence[SummaryRow], run: Mapping[str, Any]) -> str:
-    """The page ``summary.md``: the findings in words, figures, a table per task, training, how to repeat.
+    """The page ``summary.md``: the findings in words, figures, tables per task, training, how to repeat.
 
     Args:
         summary: rows of :func:`benchmarks.tables.summarise`.
         run: what is known of the run: ``command`` (how to repeat it); ``training`` (name → facts of its training,
             which may be mappings themselves, such as facts per environment); ``figures`` (relative path →
-            caption; pictures are shown, other files linked), by default :data:`FIGURES`; ``unfinished``: how many
-            jobs were not done.
+            caption; pictures are shown, other files linked), by default :data:`FIGURES`; ``blocks``, which rows
+            belong together; ``unfinished``: how many jobs were not done.
 
     Raises:
         ValueError: an empty summary.
     """
     if not summary:
         raise ValueError("no results to report: the summary is empty")
-    envs = list(dict.fromkeys(row.env for row in summary))
-    blocks = ["# Results", *what_is_left(run), *claims(summary)]
+    asked, *others = sections(summary, run.get("blocks", ()))
+    blocks = ["# Results", *what_is_left(run), *claims(asked.rows)]
     for path, caption in run.get("figures", FIGURES).items():
         blocks.append(f"{'!' if path.endswith('.png') else ''}[{caption}]({path})")
     blocks += ["## Tables", _MEANING + (_SEVERAL_SEEDS if several_seeds(summary) else _ONE_SEED)]
-    for env in envs:
-        rows = _rows_of(summary, env)
-        blocks += [f"### {_title(rows)}", _markdown_table(rows)]
+    for section in (asked, *others):
+        blocks += [f"## {section.title}"] * bool(section.title)
+        for env in dict.fromkeys(row.env for row in section.rows):
+            rows = _rows_of(section.rows, env)
+            blocks += [f"### {_title(rows)}", _markdown_table(rows)]
     lines = [
         line for name, facts in run.get("training", {}).items() for line in _fact(agent_label(name), facts)
     ]
@@ -273,8 +276,8 @@ def publish(rows: pa.Table, run: Mapping[str, Any], out: Path) -> list[SummaryRo
 
     Args:
         rows: episodes, at least one.
-        run: what is known of the run, as in :func:`summary_markdown`; ``rows``, the order of the agents; and
-            ``labels``, how those are called that no registry knows.
+        run: what is known of the run, as in :func:`summary_markdown`; ``rows``, the order of the agents;
+            ``labels``, how those are called that no registry knows; and ``blocks``, which of them belong together.
         out: folder that exists.
 
     Returns:
@@ -285,11 +288,20 @@ def publish(rows: pa.Table, run: Mapping[str, Any], out: Path) -> list[SummaryRo
         OSError: a file cannot be written.
     """
     name_rows(run.get("labels", {}))
-    summary, comparisons = analyse(rows, run.get("rows", ()))
+    blocks = run.get("blocks", ())
+    summary, comparisons = analyse(rows, run.get("rows", ()), compared(blocks))
     if not summary:
         raise ValueError("there are no episodes to report")
     write_table(out / "summary.csv", SummaryRow, summary)
     write_table(out / "comparisons.csv", ComparisonRow, comparisons)
+    asked, *others = sections(summary, blocks)
+    figures = _draw(asked.rows, out) | _draw_others(others, out)
+    atomic_write_text(out / "summary.md", summary_markdown(summary, {"figures": figures, **run}))
+    return summary
+
+
+def _draw(summary: Sequence[SummaryRow], out: Path) -> dict[str, str]:
+    """The figures of the rows that were asked for; path → caption."""
     figures: dict[str, str] = {}
     models = sorted({row.noise_model for row in summary}, key=lambda model: (model != "step", model))
     for model in models:
@@ -301,8 +313,23 @@ def publish(rows: pa.Table, run: Mapping[str, Any], out: Path) -> list[SummaryRo
                 name, caption = name.replace(".png", f"-{mark}.png"), f"{caption}: {noise_label(model)}"
             plots.save_png(figure, out / name)
             figures[name] = caption
-    atomic_write_text(out / "summary.md", summary_markdown(summary, {"figures": figures, **run}))
-    return summary
+    return figures
+
+
+def others_figure(env: str) -> str:
+    """The file name of the figure of what was measured in a task beside the rows that were asked for."""
+    return f"others-{re.sub(r'[^A-Za-z0-9]+', '-', env_label(env)).lower()}.png"
+
+
+def _draw_others(others: Sequence[Section], out: Path) -> dict[str, str]:
+    """A figure per task of what was measured beside these; path → caption."""
+    figures: dict[str, str] = {}
+    for env in dict.fromkeys(row.env for section in others for row in section.rows):
+        of_env = [Section(s.title, [row for row in s.rows if row.env == env]) for s in others]
+        name = others_figure(env)
+        plots.save_png(plots.grouped([section for section in of_env if section.rows]), out / name)
+        figures[name] = f"{env_label(env)}: controls, sweeps and other noise"
+    return figures
 
 
 def read_run(folder: Path) -> dict[str, Any]:
@@ -323,9 +350,16 @@ def read_run(folder: Path) -> dict[str, Any]:
             "training": dict(record.get("training", {})),
             "labels": {name: str(each["label"]) for name, each in variants if each["label"]},
             "unfinished": int(record.get("unfinished", 0)),
+            "blocks": [_block(each) for each in record.get("blocks", ())],
         }
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(f"{path} is not the record of a run ({type(error).__name__}: {error})") from None
+
+
+def _block(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """A block of a run's record, each part of its kind."""
+    names = {key: [str(name) for name in entry[key]] for key in ("rows", "noise_models", "envs")}
+    return {"title": str(entry["title"]), **names, "noise_levels": [float(x) for x in entry["noise_levels"]]}
 
 
 def parser() -> Parser:
@@ -364,8 +398,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("\nbenchmarks.report: interrupted", file=sys.stderr)
         return 130
-    for env in dict.fromkeys(row.env for row in summary):
-        print(summary_table_text(summary, env))
+    asked, *_ = sections(summary, run.get("blocks", ()))
+    for env in dict.fromkeys(row.env for row in asked.rows):
+        print(summary_table_text(asked.rows, env))
     print(f"Written: {out}")
     return 0
 

@@ -8,14 +8,15 @@ from typing import Any
 
 from benchmarks.labels import agent_label, count, env_label, interval, name_rows, noise_label, percent, sample
 from benchmarks.pages import Block, csv_text, markdown_table
-from benchmarks.report import EPISODES, claims, read_run, what_is_left
+from benchmarks.report import EPISODES, claims, others_figure, read_run, what_is_left
 from benchmarks.results import atomic_write_text, read_rows
+from benchmarks.sections import Section, compared, sections
 from benchmarks.tables import ComparisonRow, SummaryRow, analyse, headline_level, read_table
 from benchmarks.targets import acceptance
 
 PAGE = "README.md"
 SUMMARY, COMPARISONS = "summary.csv", "comparisons.csv"
-BLOCKS = {name: Block(name, "make results") for name in ("run", "claims", "acceptance", "tables")}
+BLOCKS = {name: Block(name, "make results") for name in ("run", "claims", "acceptance", "controls", "tables")}
 _SKELETON = """\
 # Results
 
@@ -48,6 +49,8 @@ python -m benchmarks.publish docs/results --check       # whether tables and pag
 {acceptance}
 
 ## Controls
+
+{controls}
 
 ## What was tried and failed
 
@@ -82,11 +85,13 @@ def contents(folder: Path) -> dict[str, str]:
     comparisons = read_table(folder / COMPARISONS, ComparisonRow)
     run = read_run(folder)
     name_rows(run.get("labels", {}))
+    asked, *others = sections(summary, run.get("blocks", ()))
     return {
-        "run": what_was_run(summary, run),
-        "claims": "\n\n".join(claims(summary)),
+        "run": what_was_run(asked.rows, run),
+        "claims": "\n\n".join(claims(asked.rows)),
         "acceptance": acceptance(summary, comparisons),
-        "tables": compact_tables(summary),
+        "controls": control_tables(others) or "Nothing else was measured.",
+        "tables": compact_tables(asked.rows),
     }
 
 
@@ -98,7 +103,8 @@ def stale(folder: Path) -> list[str]:
     """
     run = read_run(folder)
     name_rows(run.get("labels", {}))
-    summary, comparisons = analyse(read_rows(folder / EPISODES), run.get("rows", ()))
+    groups = compared(run.get("blocks", ()))
+    summary, comparisons = analyse(read_rows(folder / EPISODES), run.get("rows", ()), groups)
     expected = {SUMMARY: csv_text(SummaryRow, summary), COMPARISONS: csv_text(ComparisonRow, comparisons)}
     found = [name for name, text in expected.items() if _bytes(folder / name) != text.encode()]
     if found:
@@ -134,6 +140,37 @@ def compact_tables(summary: Sequence[SummaryRow]) -> str:
     return "\n\n".join(blocks)
 
 
+def control_tables(others: Sequence[Section]) -> str:
+    """Markdown: a table per section and task, a column per condition with "Safety Rate / Reach Rate"."""
+    envs = dict.fromkeys(row.env for section in others for row in section.rows)
+    blocks = [f"![{env_label(env)}: controls, sweeps and other noise]({others_figure(env)})" for env in envs]
+    for section in others:
+        blocks.append(f"### {section.title}")
+        for env in dict.fromkeys(row.env for row in section.rows):
+            rows = [row for row in section.rows if row.env == env]
+            blocks += [f"{env_label(env)}, {sample(rows, 'row')} and condition:", _condition_table(rows)]
+    return "\n\n".join(blocks)
+
+
+def _condition_table(rows: Sequence[SummaryRow]) -> str:
+    """The table of one task: a line per agent, a column per condition, clean readings first."""
+    conditions = sorted({(row.noise_level > 0, row.noise_model, row.noise_level) for row in rows})
+    by_key = {(row.agent, row.noise_model, row.noise_level): row for row in rows}
+    lines = []
+    for agent in dict.fromkeys(row.agent for row in rows):
+        cells = [by_key.get((agent, model, level)) for _, model, level in conditions]
+        lines.append([agent_label(agent), *(_both(row) for row in cells)])
+    header = [
+        "Agent",
+        *(f"`{model}` {level:g}" if noisy else "level 0" for noisy, model, level in conditions),
+    ]
+    return markdown_table(header, ["---", *["---:"] * len(conditions)], lines)
+
+
+def _both(row: SummaryRow | None) -> str:
+    return f"{percent(row.safety_rate)} / {percent(row.reach_rate)}" if row else "–"
+
+
 def _compact_table(rows: Sequence[SummaryRow]) -> str:
     """The table of one environment and noise model."""
     headline = headline_level(rows)
@@ -145,8 +182,7 @@ def _compact_table(rows: Sequence[SummaryRow]) -> str:
     for agent in dict.fromkeys(row.agent for row in rows):
         cells = _rates(by_key.get((agent, headline)))
         for level in others:
-            row = by_key.get((agent, level))
-            cells.append(f"{percent(row.safety_rate)} / {percent(row.reach_rate)}" if row else "–")
+            cells.append(_both(by_key.get((agent, level))))
         lines.append([agent_label(agent), *cells])
     return markdown_table(header, ["---", *["---:"] * (len(header) - 1)], lines)
 

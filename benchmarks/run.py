@@ -18,7 +18,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from benchmarks.labels import count
-from benchmarks.protocol import PRESETS, Plan, make_plan, with_filters
+from benchmarks.presets import PRESETS
+from benchmarks.protocol import Plan, make_plan, with_filters
 from rise_agents.cli import Parser, prepare_folder
 
 if TYPE_CHECKING:
@@ -54,10 +55,9 @@ def parser() -> Parser:
     p.add_argument(
         "--agents",
         nargs="+",
-        default=["rise", "pcbc", "cppo"],
         metavar="NAME",
         help="agents and variants to compare; 'expert' and 'random' add reference rows, NAME+kalman is NAME behind"
-        " a filter, expert+true the experts on true readings (default: rise pcbc cppo)",
+        " a filter, expert+true the experts on true readings (default: the preset's, mostly rise pcbc cppo)",
     )
     p.add_argument(
         "--envs", nargs="+", metavar="ID", help="environments (default: all whose results are reported)"
@@ -110,10 +110,9 @@ def parser() -> Parser:
     p.add_argument(
         "--noise-model",
         nargs="+",
-        default=["step"],
         metavar="MODEL",
         help="step, outlier, episode, drift, dropout, delay, quantise, sums as in step+episode, or on some channels"
-        " only, as in step@position+episode@radius (default: step)",
+        " only, as in step@position+episode@radius (preset quick: step)",
     )
     p.add_argument("--demos", type=int, metavar="N", help="expert episodes to learn from, per environment")
     p.add_argument("--expert", default="mixture", metavar="NAME", help="who demonstrates (default: mixture)")
@@ -188,11 +187,11 @@ def plan_of(arguments: argparse.Namespace) -> Plan:
         arguments.preset,
         parse_settings(arguments.settings),
         arguments.config,
-        agents=with_filters(arguments.agents, arguments.filter),
+        agents=_rows(arguments),
         envs=tuple(dict.fromkeys(arguments.envs or reported)),
         demos=arguments.demos,
         episodes=arguments.episodes,
-        noise_models=tuple(dict.fromkeys(arguments.noise_model)),
+        noise_models=None if arguments.noise_model is None else tuple(dict.fromkeys(arguments.noise_model)),
         noise_levels=None if arguments.noise_levels is None else tuple(sorted(set(arguments.noise_levels))),
         seeds=arguments.seeds,
         expert=arguments.expert,
@@ -215,6 +214,14 @@ def _source(folder: Path | None, out: Path) -> Published | None:
     if folder.resolve() == out.resolve():
         raise ValueError(f"--out is the folder of published results itself, {str(out)!r}: name another")
     return found
+
+
+def _rows(arguments: argparse.Namespace) -> tuple[str, ...] | None:
+    """The rows that were asked for; None: those of the preset."""
+    if arguments.agents is None and not arguments.filter:
+        return None
+    preset = PRESETS.get(arguments.preset)
+    return with_filters(arguments.agents or (preset.agents if preset else ()), arguments.filter)
 
 
 def _has_gpu_driver() -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
@@ -110,12 +110,15 @@ class _Group:
     outcomes: dict[str, stats.Table]
 
 
-def analyse(rows: pa.Table, agents: Sequence[str] = ()) -> tuple[list[SummaryRow], list[ComparisonRow]]:
+def analyse(
+    rows: pa.Table, agents: Sequence[str] = (), compared: Sequence[Collection[str]] = ()
+) -> tuple[list[SummaryRow], list[ComparisonRow]]:
     """Both tables of a run: everything that its pages and figures say follows from them.
 
     Args:
         rows: episodes (:data:`benchmarks.results.SCHEMA`), in any order.
         agents: the order of the agents; those not named follow, by name.
+        compared: groups of agents; only agents of a common group are compared. None: all with all.
 
     Returns:
         A line per (env, agent, noise model, noise level), in that order; and per env, noise model and level a line
@@ -132,7 +135,7 @@ def analyse(rows: pa.Table, agents: Sequence[str] = ()) -> tuple[list[SummaryRow
     for condition in _split(rows, _CONDITION):
         groups = sorted(_groups(condition), key=lambda group: (rank.get(group.name, len(rank)), group.name))
         summary += _summarise(groups)
-        comparisons += _compare(groups)
+        comparisons += _compare(groups, compared)
     comparisons = _corrected(comparisons)
     summary.sort(key=lambda r: (r.env, rank.get(r.agent, len(rank)), r.agent, r.noise_model, r.noise_level))
     return _with_differences(summary, comparisons), comparisons
@@ -232,11 +235,15 @@ def _summarise(groups: Sequence[_Group]) -> list[SummaryRow]:
     return summary
 
 
-def _compare(groups: Sequence[_Group]) -> list[ComparisonRow]:
-    """The lines of all pairs under one condition; p-values not yet corrected."""
+def _compare(groups: Sequence[_Group], compared: Sequence[Collection[str]]) -> list[ComparisonRow]:
+    """The lines of all pairs of common groups under one condition; p-values not yet corrected."""
     tested = [group for group in groups if not is_reference(group.name)]
     references = [group for group in groups if is_reference(group.name)]
-    pairs = [*itertools.combinations(tested, 2), *itertools.product(tested, references)]
+    pairs = [
+        (a, b)
+        for a, b in [*itertools.combinations(tested, 2), *itertools.product(tested, references)]
+        if not compared or any(a.name in names and b.name in names for names in compared)
+    ]
     # In the order of the agents, references last.
     order = {group.name: index for index, group in enumerate([*tested, *references])}
     pairs.sort(key=lambda pair: (order[pair[0].name], order[pair[1].name]))

@@ -107,10 +107,10 @@ class Rise:
     SEARCH: ClassVar[dict[str, Space]] = {
         EVERYWHERE: {
             **cloning.SEARCH,
-            "latent": Choice((3, 5, 8, 12)),
-            "beta": LogRange(0.01, 1.0),
-            "n_samples": Choice((4, 8, 16)),
-            "vae_updates": Choice((5_000, 10_000)),
+            "latent": Choice((3, 5, 8)),
+            "beta": LogRange(0.02, 0.3),  # less does as PC-BC, more costs too much on true readings
+            "n_samples": Choice((4, 8)),
+            "average": Choice((1, 16)),
         }
     }
     ACTING: ClassVar[frozenset[str]] = frozenset({"average", "posterior"})

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from benchmarks.configs import SHIPPED, read
-from benchmarks.protocol import PRESETS, make_plan
+from benchmarks.presets import PRESETS
 from benchmarks.results import SCHEMA
 from benchmarks.run import parser
 from benchmarks.speed.page import BLOCK
@@ -24,7 +24,6 @@ from benchmarks.speed.rows import ROWS
 from benchmarks.tables import ComparisonRow, SummaryRow
 from benchmarks.tune.__main__ import parser as tune_parser
 from rise_agents import AGENTS, agent_class, readings
-from rise_agents.agent import make_config
 from rise_agents.belief.agent import Config as BeliefConfig
 from rise_agents.cloning import CloningConfig
 from rise_agents.experts import EXPERTS
@@ -312,28 +311,18 @@ def test_the_table_of_presets_agrees_with_them(preset):
     place = list(PRESETS).index(preset) + 1
     said = {row[0]: row[place] for row in table("benchmark.md", "", *heads)}
     known = PRESETS[preset]
-    plan = make_plan(preset, {}, agents=tuple(AGENTS), envs=tuple(TASKS), noise_models=("step",))
-
-    def setting(agent: str, env: str, field: str) -> int:
-        return getattr(make_config(agent_class(agent), env, plan.config(agent, env)), field)
-
     assert number(said.pop("demonstrations, episodes per environment")) == known.demos
     assert number(said.pop("test scenarios per condition")) == known.episodes
     levels = tuple(float(level) for level in said.pop("noise levels").split(", "))
     assert levels == known.noise_levels
     assert number(said.pop("training seeds")) == known.seeds
     assert number(said.pop("scenarios in a clip")) == known.clips
-    for name, agents, field in (
-        ("rise: gradient steps of stage 1", ("rise",), "vae_updates"),
-        ("rise: gradient steps of stage 2", ("rise",), "updates"),
-        ("pcbc: gradient steps", ("pcbc",), "updates"),
-        ("rise, pcbc: batch size", ("rise", "pcbc"), "batch_size"),
-    ):
-        words = said.pop(name)
-        assert {setting(agent, env, field) for agent in agents for env in TASKS} == {number(words)}
-    for env, words in zip(TASKS, ("vehicle", "Panda"), strict=True):
-        told = number(said.pop(f"cppo: environment steps, {words}"))
-        assert told == setting("cppo", env, "total_steps")
+    for field, words in (("agents", "rows"), ("noise_models", "noise models")):
+        assert tuple(said.pop(words).split(", ")) == getattr(known, field)
+    assert number(said.pop("blocks beside these")) == len(known.blocks)
+    settings = {"tuned.toml": known.tuned, "BRIEF": known.brief, "own": not (known.tuned or known.brief)}
+    words = said.pop("settings")
+    assert {word: word in words for word in settings} == settings
     assert not said
 
 

@@ -10,6 +10,7 @@ from matplotlib.image import imread
 from matplotlib.text import Text
 
 from benchmarks import labels, plots, stats
+from benchmarks.sections import Section
 from benchmarks.tables import SummaryRow
 
 VEHICLE, PANDA = "RISE-GroundVehicle-v0", "RISE-SafePanda-v0"
@@ -85,6 +86,55 @@ def test_all_words_stand_inside_the_figure_and_apart(summary):
             assert figure.bbox.y0 <= box.y0 and box.y1 <= figure.bbox.y1, text
         for (text, box), (other, other_box) in itertools.combinations(found, 2):
             assert not box.overlaps(other_box), (text, other)
+
+
+def make_sections(summary):
+    """Three groups of other rows, one of them under two noise models."""
+    noisy = make_summary(agents=("rise", "rise-belief"), levels=(1.0,), noise_model="drift:0.3")
+    noisy += make_summary(agents=("rise", "rise-belief"), levels=(1.0,), noise_model="step@position+delay:5")
+    return [
+        Section("Is it the encoder?", [row for row in summary if row.agent in ("rise", "pcbc")]),
+        Section("Noise of other kinds", noisy),
+        Section("Experts", make_summary(agents=("expert", "random"), levels=(0.0, 2.0))),
+    ]
+
+
+@pytest.mark.parametrize("env", [VEHICLE, PANDA])
+def test_groups_stand_under_their_titles_with_the_rates_of_their_level(env):
+    sections = [
+        Section(s.title, [row for row in s.rows if row.env == env]) for s in make_sections(make_summary())
+    ]
+    figure = plots.grouped(sections)
+    found = texts(figure)
+    for text, box in found:
+        assert figure.bbox.x0 <= box.x0 and box.x1 <= figure.bbox.x1, text
+    for (text, box), (other, other_box) in itertools.combinations(found, 2):
+        assert not box.overlaps(other_box), (text, other)
+    own = [label.get_text() for label in figure.axes[0].get_yticklabels()]
+    both = ["", "", "RISE", "RISE-belief"]
+    assert own == ["", "RISE", "PC-BC", *both, *both, "", "", "Expert", "Random"]
+    titles = {
+        text: place for text, place in ((t.get_text(), t.get_position()[1]) for t in figure.axes[0].texts)
+    }
+    assert {
+        text: place for text, place in titles.items() if " " in text.strip(" %") or text == "Experts"
+    } == {
+        "Is it the encoder?": 0,
+        "Noise of other kinds: a drifting error (0.3)": 4,
+        "Noise of other kinds: fresh noise at every step, positions only + delayed readings (5)": 8,
+        "Experts": 12,
+    }
+    shown = [
+        row for s in sections for row in s.rows if row.noise_level == (2.0 if s.title == "Experts" else 1.0)
+    ]
+    for panel, key in zip(figure.axes, ("safety", "reach"), strict=True):
+        widths = [patch.get_width() for patch in panel.patches]
+        assert widths == pytest.approx([100 * getattr(row, f"{key}_rate") for row in shown])
+
+
+def test_a_figure_of_no_groups_is_refused():
+    with pytest.raises(ValueError, match="no rows to draw"):
+        plots.grouped([])
 
 
 def test_comparison_draws_the_rates_and_intervals_of_its_level():

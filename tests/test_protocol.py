@@ -8,7 +8,9 @@ from dataclasses import asdict
 import pytest
 
 from benchmarks.labels import agent_label, is_reference, name_rows, split_row
+from benchmarks.presets import PRESETS, Block
 from benchmarks.protocol import make_plan, with_filters
+from rise_agents import agent_class
 
 VEHICLE, PANDA = "RISE-GroundVehicle-v0", "RISE-SafePanda-v0"
 
@@ -45,8 +47,66 @@ def test_a_filter_adds_a_row_to_every_row_that_reads():
 
 def test_level_0_is_measured_once():
     run = plan("rise", noise_models=("episode", "step"), noise_levels=(0.0, 1.0))
-    assert run.conditions() == [("episode", 0.0), ("episode", 1.0), ("step", 1.0)]
-    assert plan("rise", noise_levels=(0.0, 1.0)).conditions() == [("step", 0.0), ("step", 1.0)]
+    assert run.conditions(VEHICLE, "rise", 1) == [("episode", 0.0), ("episode", 1.0), ("step", 1.0)]
+    alone = plan("rise", noise_levels=(0.0, 1.0))
+    assert alone.conditions(PANDA, "rise", 0) == [("step", 0.0), ("step", 1.0)]
+
+
+def test_a_block_adds_rows_and_conditions_of_its_own():
+    blocks = (
+        Block("drift", ("pcbc", "rise-mean", "random"), ("drift:0.3",), (0.0, 1.0), 3),
+        Block("here", ("expert-cbf+kalman", "expert"), ("step",), (2.0,), 2, (VEHICLE,)),
+    )
+    run = plan("rise", "pcbc", noise_levels=(0.0, 1.0), blocks=blocks)
+    own, drift = [("step", 0.0), ("step", 1.0)], [("step", 0.0), ("drift:0.3", 1.0)]
+    met = {row: run.conditions(PANDA, *row) for row in run.rows(PANDA)}
+    assert met == {  # level 0 is the same for every model, and is measured under the first
+        **dict.fromkeys((("rise", 0), ("rise", 1)), own),
+        **{key: [*own, drift[1]] for key in (("pcbc", 0), ("pcbc", 1))},
+        ("pcbc", 2): drift,
+        **dict.fromkeys((("rise-mean", 0), ("rise-mean", 1), ("rise-mean", 2), ("random", 0)), drift),
+    }
+    experts = ["expert-cbf+kalman", "expert-cbf", "expert-mpc", "expert-mixture"]
+    assert run.rows(VEHICLE) == [*run.rows(PANDA), *((row, 0) for row in experts)]
+    names = [["rise", "pcbc"], ["pcbc", "rise-mean", "random"], experts]
+    assert [block["rows"] for block in run.described()] == names
+    assert set(run.variants) == {"rise-mean"}
+    assert len(plan("rise", envs=(PANDA,), blocks=blocks[1:]).described()) == 1  # which is not of this run
+
+
+@pytest.mark.parametrize(
+    ("block", "says"),
+    [
+        (Block("x", ("rise-meen",), ("step",), (1.0,), 1), "unknown agent 'rise-meen'"),
+        (Block("x", ("expert-cfb",), ("step",), (1.0,), 1), "did you mean 'expert-cbf'"),
+        (Block("x", ("rise",), ("stp",), (1.0,), 1), "did you mean 'step'"),
+        (Block("x", ("rise",), ("step",), (-1.0,), 1), "noise levels must be finite"),
+        (Block("x", ("rise",), ("step",), (1.0,), 0), "seeds must be a whole number"),
+        (Block("x", ("rise",), ("step",), (1.0,), 1, ("RISE-Moon-v0",)), "unknown environment"),
+        (Block("x", (), ("step",), (1.0,), 1), "at least one agent"),
+    ],
+)
+def test_what_is_wrong_with_a_block_is_told(block, says):
+    with pytest.raises(ValueError, match=says):
+        plan("rise", blocks=(block,))
+
+
+def test_the_rows_of_a_preset_are_those_of_its_blocks_unless_one_names_some():
+    chosen = {"envs": (VEHICLE, PANDA)}
+    paper = make_plan("paper", {}, **chosen)
+    assert paper.agents == PRESETS["paper"].agents and paper.noise_models == ("step", "episode")
+    assert len(paper.described()) == 1 + len(PRESETS["paper"].blocks)
+    rows = {row for row, _ in paper.rows(VEHICLE)}
+    assert rows >= {"expert-cbf", "expert-mpc", "rise-z2", "rise+kalman", "random"}
+    assert {seed for row, seed in paper.rows(PANDA) if row == "rise"} == set(range(5))
+    assert {seed for row, seed in paper.rows(PANDA) if row == "rise-mean"} == set(range(3))
+    assert make_plan("paper", {}, agents=("pcbc",), **chosen).blocks == ()
+
+
+def test_smoke_trains_every_agent_as_briefly_as_it_says():
+    run = make_plan("smoke", {"rise": {"updates": 7}}, agents=("rise-beta1", "rise-belief"), envs=(VEHICLE,))
+    assert run.config("rise-belief", VEHICLE) == agent_class("rise-belief").BRIEF
+    assert run.config("rise-beta1", VEHICLE) == {**agent_class("rise").BRIEF, "updates": 7, "beta": 1.0}
 
 
 def test_experts_that_demonstrate():

@@ -23,6 +23,7 @@ from benchmarks.jobs import (
     wanted,
 )
 from benchmarks.labels import split_row
+from benchmarks.presets import Block
 from benchmarks.protocol import make_plan
 from benchmarks.run import main
 from rise_agents import checkpoint, pretrained
@@ -162,7 +163,7 @@ def pretend(run, folder, **changes):
     """Published results of a plan that nobody has run."""
     tables, rows = [], run.rows(VEHICLE)
     for row, seed in rows:
-        for model, level in run.conditions():
+        for model, level in run.conditions(VEHICLE, row, seed):
             for part in run.chunks(VEHICLE):
                 seeds = part.seeds()
                 names = {"agent": row, "train_seed": seed, "noise_model": model, "noise_level": level}
@@ -240,6 +241,18 @@ def test_more_seeds_and_levels_are_found_as_far_as_they_go(tmp_path):
     more = plan("pcbc", "expert+true", seeds=2, noise_levels=(0.5, 1.0))
     experts = [(f"expert-{name}+true", 0, "step", 1.0) for name in ("cbf", "mpc", "mixture")]
     assert found(source, more, tmp_path / "run") == [("pcbc", 0, "step", 1.0), *experts]
+
+
+def test_rows_of_other_blocks_are_found_under_their_own_conditions(tmp_path):
+    block = Block("", ("pcbc", "rise-mean"), ("step", "episode"), (1.0,), 1)
+    run = plan("pcbc", "random", blocks=(block,))
+    source, out = pretend(run, tmp_path / "docs"), tmp_path / "run"
+    every = found(source, run, out)
+    assert [each for each in every if each[0] == "rise-mean"] == [
+        ("rise-mean", 0, "step", 1.0),
+        ("rise-mean", 0, "episode", 1.0),
+    ]
+    assert len(every) == len(evaluation_jobs(run, out)) == 3 + 2 + 2
 
 
 def test_another_version_has_nothing_to_give(tmp_path):

@@ -108,6 +108,31 @@ def test_a_run_becomes_a_folder_that_agrees_with_itself(run, published):
     assert results_page.stale(published) == []
 
 
+def test_blocks_of_a_run_have_tables_of_their_own(run, tmp_path):
+    record = json.loads((run / "run.json").read_text())
+    asked = {"title": "", "rows": ["rise"], "noise_models": ["step"], "noise_levels": [0, 1, 2], "envs": []}
+    other = {"title": "Is it PC-BC?", "rows": ["rise", "pcbc"], "noise_models": ["step", "episode"]}
+    record["blocks"] = [asked, {**other, "noise_levels": [0, 1], "envs": [ENVS[0]]}]
+    (run / "run.json").write_text(json.dumps(record))
+    publish.publish(run, tmp_path / "out")
+    assert results_page.stale(tmp_path / "out") == []
+    page = (tmp_path / "out" / "README.md").read_text()
+    findings, _, rest = page.partition("## Controls")
+    controls, _, tables = rest.partition("## What was tried")
+    assert "PC-BC" not in findings.replace("pcbc", "") and "PC-BC" not in tables
+    lines = [line for line in controls.splitlines() if line.startswith("|")]
+    assert lines[0] == "| Agent | level 0 | `episode` 1 | `step` 1 |"
+    assert [line.split(" | ")[0] for line in lines[2:]] == ["| RISE", "| PC-BC"]  # of the one environment
+    assert "### Is it PC-BC?" in controls and "(others-ground-vehicle.png)" in controls
+    assert {path.name for path in (tmp_path / "out").glob("*.png")} == {
+        *("comparison.png", "noise_curve.png", "others-ground-vehicle.png")
+    }
+    record["blocks"] = [{**asked, "noise_levels": "all"}]
+    (run / "run.json").write_text(json.dumps(record))
+    with pytest.raises(ValueError, match=r"run\.json is not the record of a run"):
+        publish.publish(run, tmp_path / "out")
+
+
 def test_the_same_run_gives_the_same_files(run, published, tmp_path):
     publish.publish(run, tmp_path / "again")
     assert contents(tmp_path / "again") == contents(published)
@@ -288,6 +313,22 @@ def test_an_unfinished_run_is_published_only_when_asked_for(run, tmp_path, capsy
     unfinished(run, lambda row: False, unfinished=0)  # it went on to the end
     publish.publish(run, out)
     assert "Not finished" not in (out / "README.md").read_text()
+
+
+@pytest.mark.parametrize("asked", [["rise"], ["absent"]], ids=["in one task", "nowhere"])
+def test_an_unfinished_run_may_have_other_blocks_first(asked, run, tmp_path, capsys):
+    """What was asked for is not there yet, in one task or in both; what was measured beside it is."""
+    block = {"title": "", "rows": asked, "noise_models": ["step"], "noise_levels": [0, 1, 2], "envs": []}
+    blocks = [block, {**block, "title": "Is it PC-BC?", "rows": ["pcbc"]}]
+    gone = ("rise", ENVS[1])
+    unfinished(run, lambda row: (row["agent"], row["env"]) == gone, unfinished=2, blocks=blocks)
+    out = tmp_path / "out"
+    assert publish.main([str(run), "--out", str(out), "--partial"]) == 0
+    assert results_page.stale(out) == []
+    assert report.main([str(out), "--out", str(tmp_path / "x")]) == 0
+    assert capsys.readouterr().out.count("RISE ") == (3 if asked == ["rise"] else 0)
+    page = (out / "README.md").read_text()
+    assert page.count("Not finished") == 1 and page.count("### Is it PC-BC?") == 1
 
 
 def test_what_failed_counts_as_left(run, tmp_path):

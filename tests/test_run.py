@@ -9,6 +9,8 @@ import shutil
 import subprocess
 import sys
 import time
+from collections import Counter
+from dataclasses import replace
 
 import gymnasium as gym
 import imageio.v3 as iio
@@ -19,9 +21,11 @@ from benchmarks import report, results
 from benchmarks.executors import run_jobs
 from benchmarks.jobs import Job, demonstrations_folder
 from benchmarks.pipeline import How, execute
-from benchmarks.protocol import PRESETS, make_plan
+from benchmarks.presets import PRESETS, Block
+from benchmarks.protocol import make_plan
 from benchmarks.run import main, parser, plan_of, time_limit
 from benchmarks.tables import ComparisonRow, read_table
+from rise_agents import agent_class
 from rise_agents.files import sole_user
 from rise_agents.seeds import SPLITS
 from rise_envs import ENVS, STAND_INS
@@ -110,7 +114,7 @@ def test_run_json_tells_how_to_repeat(run):
     record = json.loads((run / "run.json").read_text())
     assert record["plan"]["noise_levels"] == [0.0, 1.0]
     assert record["demonstrations"][VEHICLE]["expert"] == "cbf"
-    assert record["settings"][f"rise@{VEHICLE}"]["updates"] == PRESETS["smoke"].settings["rise"]["updates"]
+    assert record["settings"][f"rise@{VEHICLE}"]["updates"] == agent_class("rise").BRIEF["updates"]
     assert "--noise-levels 0 1" in record["command"]
     assert record["rows"] == ["rise", "pcbc", "random"] and set(record["training"]) == {"rise", "pcbc"}
 
@@ -176,6 +180,32 @@ def test_rows_of_all_kinds_under_several_noise_models(tmp_path):
     assert record["plan"]["noise_models"] == ["step", "episode"]
     paths = record["agents"][VEHICLE]
     assert paths["quiet+kalman-seed0"] == paths["pcbc-seed0"] != paths["pcbc-noisy-seed0"]
+
+
+def test_blocks_of_a_preset_are_measured_and_told_apart(tmp_path, monkeypatch):
+    block = Block("Is it the noise?", ("pcbc", "pcbc-noisy", "random"), ("drift:0.3",), (0.0, 1.0), 2)
+    preset = replace(PRESETS["smoke"], agents=("pcbc",), noise_levels=(0.0, 1.0), blocks=(block,), episodes=4)
+    monkeypatch.setitem(PRESETS, "smoke", preset)
+    arguments = ["--preset", "smoke", "--envs", VEHICLE, "--expert", "cbf", "--workers", "1", "--no-videos"]
+    assert main([*arguments, "--out", str(tmp_path)]) == 0
+    rows = results.read_rows(tmp_path / "episodes.parquet").to_pylist()
+    met = Counter((row["agent"], row["train_seed"], row["noise_model"], row["noise_level"]) for row in rows)
+    drift = [("step", 0.0), ("drift:0.3", 1.0)]
+    expected = [("pcbc", 0, *condition) for condition in [*drift, ("step", 1.0)]]
+    expected += [("pcbc", 1, *c) for c in drift] + [("pcbc-noisy", s, *c) for s in (0, 1) for c in drift]
+    assert met == Counter(dict.fromkeys(expected + [("random", 0, *c) for c in drift], 4))
+    pairs = {(row.agent, row.other) for row in read_table(tmp_path / "comparisons.csv", ComparisonRow)}
+    assert pairs == {("pcbc", "pcbc-noisy"), ("pcbc", "random"), ("pcbc-noisy", "random")}
+    page = (tmp_path / "summary.md").read_text()
+    findings, _, tables = page.partition("## Tables")
+    own, _, block_tables = tables.partition("## Is it the noise?")
+    assert "PC-BC, noisy training" not in findings + own and "PC-BC, noisy training" in block_tables
+    assert "others-ground-vehicle.png" in findings and (tmp_path / "others-ground-vehicle.png").exists()
+    for name in ("episodes.parquet", "run.json"):
+        shutil.copy(tmp_path / name, tmp_path / "agents")
+    assert report.main([str(tmp_path / "agents")]) == 0  # from what is recorded alone
+    for name in ("summary.csv", "comparisons.csv", "summary.md", "others-ground-vehicle.png"):
+        assert (tmp_path / "agents" / name).read_bytes() == (tmp_path / name).read_bytes()
 
 
 def test_workers_do_not_change_the_tables(run, tmp_path):
@@ -253,7 +283,7 @@ def test_a_plan_adds_the_user_s_choices_to_the_preset():
     assert plan.episodes == 5
     assert plan.demos == PRESETS["smoke"].demos
     assert plan.config("rise", VEHICLE)["beta"] == 0.2
-    assert plan.config("rise", VEHICLE)["updates"] == PRESETS["smoke"].settings["rise"]["updates"]
+    assert plan.config("rise", VEHICLE)["updates"] == agent_class("rise").BRIEF["updates"]
     assert [row for row, _ in plan.rows(VEHICLE)] == ["rise", "expert-cbf", "expert-mpc", "expert-mixture"]
 
 

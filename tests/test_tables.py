@@ -207,6 +207,16 @@ def test_lines_are_ordered_and_do_not_depend_on_the_order_of_rows():
     assert tables.analyse(rows[:0]) == ([], [])
 
 
+def test_only_agents_of_a_common_group_are_compared():
+    names = ("rise", "pcbc", "cppo", "random")
+    rows = pa.concat_tables([outcomes(A, agent=name) for name in names])
+    summary, comparisons = tables.analyse(rows, names, [{"rise", "pcbc"}, {"pcbc", "cppo", "random"}])
+    assert [(row.agent, row.other) for row in comparisons] == [
+        *(("rise", "pcbc"), ("pcbc", "cppo"), ("pcbc", "random"), ("cppo", "random")),
+    ]
+    assert [row.against for row in summary] == ["", "rise", "", ""]
+
+
 def test_summary_csv_is_stable_text(tmp_path):
     summary = tables.summarise(make_rows(noise_level=0.5))
     tables.write_table(tmp_path / "summary.csv", tables.SummaryRow, summary)
