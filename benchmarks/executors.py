@@ -38,6 +38,7 @@ def run_jobs(
     watch: Watcher,
     say: Callable[[str], None] = lambda line: None,
     time_is_up: Callable[[], bool] = never,
+    longest_first: bool = True,
 ) -> list[Failure]:
     """Run all jobs whose output is missing; those that need a failed job's output are not run.
 
@@ -47,6 +48,7 @@ def run_jobs(
         watch: told of progress.
         say: told, in one line, when a worker process has died or a job has failed.
         time_is_up: asked about once a second; when it is, what runs is interrupted and nothing more is started.
+        longest_first: start the longest job first of those that can start, else the first in ``jobs``.
 
     Returns:
         What failed. A failure stops nothing but the jobs that depend on it. Jobs whose output is missing, but which
@@ -55,7 +57,9 @@ def run_jobs(
     for job in jobs:
         if job.output.exists():
             watch(job, 1.0, {})
-    pending = sorted((job for job in jobs if not job.output.exists()), key=lambda job: -job.weight)
+    pending = [job for job in jobs if not job.output.exists()]
+    if longest_first:
+        pending.sort(key=lambda job: -job.weight)
     if not pending:
         return []
 

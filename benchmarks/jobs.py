@@ -39,7 +39,7 @@ class Job:
         arguments: its arguments.
         output: the file whose existence says that the job is done.
         needs: outputs of other jobs that must exist first.
-        weight: rough relative duration; long jobs start first.
+        weight: rough relative duration; long jobs start first where nothing else is said.
     """
 
     name: str
@@ -165,6 +165,23 @@ def wanted(jobs: Sequence[Job], ends: Sequence[Job]) -> list[Job]:
         asked |= missing
         open_ends = [by_output[path] for path in missing if path in by_output]
     return [job for job in jobs if job.output in asked or job.output.exists()]
+
+
+def in_turn(jobs: Sequence[Job], ends: Sequence[Job]) -> list[Job]:
+    """``jobs`` such that each of ``ends`` follows what it needs, and so on: who stops early has whole rows."""
+    by_output = {job.output: job for job in jobs}
+    ordered: dict[Path, Job] = {}
+
+    def take(path: Path) -> None:
+        job = by_output.get(path)
+        if job is not None and path not in ordered:
+            for need in job.needs:
+                take(need)
+            ordered[path] = job
+
+    for end in ends:
+        take(end.output)
+    return [*ordered.values(), *(job for job in jobs if job.output not in ordered)]
 
 
 def tidy(out: Path) -> None:

@@ -20,6 +20,7 @@ from benchmarks.jobs import (
     complete_settings,
     demonstrations_folder,
     evaluation_jobs,
+    in_turn,
     recording_jobs,
     tidy,
     training_jobs,
@@ -91,7 +92,10 @@ def execute(plan: Plan, out: Path, how: How) -> Outcome:
         before = [*recording_jobs(plan, out), *training_jobs(plan, out, how.device, how.every)]
         jobs = wanted([*before, *ends], ends)
         display.plan(jobs)
-        failures = run_jobs(jobs, how.workers, display.watch, display.say, how.time_is_up)
+        # All workers stay busy to the end if long jobs start first; rows are whole as soon as can be if they do not.
+        limited = how.time_is_up is not never
+        turn = in_turn(jobs, ends) if limited else jobs
+        failures = run_jobs(turn, how.workers, display.watch, display.say, how.time_is_up, not limited)
     # Asked again: pieces of a set of demonstrations are gone, and not needed, as soon as it is put together.
     outcome = Outcome(failures, [job for job in wanted(jobs, ends) if not job.output.exists()])
     _write_failures(out / "failures.log", failures)

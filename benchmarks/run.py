@@ -253,10 +253,10 @@ def _check_device(device: str) -> None:
 
 
 def time_limit(
-    hours: float | None, started: float, clock: Callable[[], float] = time.perf_counter
+    hours: float, started: float, clock: Callable[[], float] = time.perf_counter
 ) -> Callable[[], bool]:
-    """What says whether ``hours`` have passed since ``started``, seconds of ``clock``; None: never."""
-    return lambda: hours is not None and clock() - started >= 3600 * hours
+    """What says whether ``hours`` have passed since ``started``, seconds of ``clock``."""
+    return lambda: clock() - started >= 3600 * hours
 
 
 def _told(outcome: Outcome, hours: float | None) -> list[str]:
@@ -285,6 +285,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 130
     command = ("python", "-m", "benchmarks.run", *(sys.argv[1:] if argv is None else argv))
     try:
+        from benchmarks.executors import never
         from benchmarks.pipeline import How, execute
         from rise_agents.files import sole_user
         from rise_agents.workers import available_cores
@@ -296,7 +297,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             every=arguments.checkpoint_every,
             command=command,
             source=source,
-            time_is_up=time_limit(arguments.hours, started),
+            time_is_up=never if arguments.hours is None else time_limit(arguments.hours, started),
         )
         with sole_user(out):
             outcome = execute(plan, out, how)

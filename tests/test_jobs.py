@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks import results
+from benchmarks.executors import run_jobs
 from benchmarks.jobs import (
     Job,
     check_settings,
@@ -14,6 +15,7 @@ from benchmarks.jobs import (
     evaluate,
     evaluation_jobs,
     how_it_acts,
+    in_turn,
     recording_jobs,
     train,
     training_jobs,
@@ -70,6 +72,34 @@ def test_each_expert_demonstrates_into_its_own_folder(tmp_path):
     data = {job.name: job.arguments["data"] for job in training_jobs(run, tmp_path, "cpu", 15.0)}
     assert data[f"train rise-mpc on {VEHICLE}"] == folders[1]
     assert data[f"train rise on {VEHICLE}"] == data[f"train pcbc on {VEHICLE}"] == folders[0]
+
+
+def _mark(output, progress, log):
+    with log.open("a") as file:
+        file.write(f"{output.name}\n")
+    output.touch()
+
+
+def test_in_turn_each_row_is_whole_before_the_next_begins(tmp_path):
+    log = tmp_path / "log"
+
+    def job(name, *needs, weight=1.0):
+        paths = tuple(tmp_path / need for need in needs)
+        return Job(name, _mark, {"log": log}, tmp_path / name, paths, weight)
+
+    ends = [job("test a", "train a"), job("test b", "train b"), job("test a again", "train a")]
+    before = [job("record"), job("spare"), job("train b", "record", weight=9.0), job("train a", "record")]
+    turn = in_turn([*before, *ends], ends)
+    assert sorted(each.name for each in turn) == sorted(each.name for each in [*before, *ends])
+    order = ["record", "train a", "test a", "train b", "test b", "test a again", "spare"]
+    assert [each.name for each in turn] == order
+    assert run_jobs(turn, 1, lambda job, share, figures: None, longest_first=False) == []
+    assert log.read_text().splitlines() == order
+    for each in turn:
+        each.output.unlink()
+    log.unlink()
+    assert run_jobs(turn, 1, lambda job, share, figures: None) == []
+    assert log.read_text().splitlines()[:3] == ["record", "train b", "train a"]
 
 
 def test_several_noise_models_share_level_0(tmp_path):

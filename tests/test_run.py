@@ -371,7 +371,7 @@ def test_a_time_limit_counts_from_the_start():
     now[0] += 1799
     assert not time_is_up()
     now[0] += 1
-    assert time_is_up() and not time_limit(None, 0.0, lambda: 1e9)()
+    assert time_is_up()
 
 
 def _wait(output, progress, pid):
