@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import shutil
 import tomllib
 from pathlib import Path
 
@@ -274,6 +275,23 @@ def test_the_best_mean_over_the_seeds_is_chosen_from_the_finalists(tmp_path, mon
         (trial, seed) for trial in "36" for seed in "012"
     ]
     assert len(lines) == 7 + 2 * 2 and all(json.loads(line["settings"]) in trials for line in lines)
+
+
+def test_what_has_its_rates_is_not_trained_again(tmp_path, monkeypatch):
+    run, calls = made_up(lambda settings, seed: Rates(1.0, 1.0, 0.5, 0.5))
+    monkeypatch.setattr(search, "run_jobs", run)
+    command = ["--agents", "cppo", "--envs", VEHICLE, "--trials", "4", "--out", str(tmp_path)]
+    assert main(command) == 0
+    shutil.rmtree(tmp_path / "agents")  # a search goes on from its rates alone
+    calls.clear()
+    assert main(command) == 0 and calls == []
+    command[command.index("4")] = "5"
+    assert main(command) == 0
+    assert calls == [
+        f"{do} cppo on {VEHICLE}, trial {n}, seed {s}"
+        for n, s in ((4, 0), (1, 1), (1, 2))
+        for do in ("train", "judge")
+    ]
 
 
 def test_the_same_budget_for_everybody_and_other_tables_are_kept(tmp_path, monkeypatch):

@@ -8,11 +8,11 @@ from pathlib import Path
 
 from benchmarks.display import Display
 from benchmarks.executors import Failure, run_jobs
-from benchmarks.jobs import Job, demonstrations_folder, recording_jobs, tidy
+from benchmarks.jobs import Job, demonstrations_folder, recording_jobs, tidy, wanted
 from benchmarks.protocol import Plan, imitates
 from benchmarks.tune import report
 from benchmarks.tune.ranking import Rates, best_clean, finalists, mean, ranked
-from benchmarks.tune.studies import Study, condition, drawn_trials
+from benchmarks.tune.studies import Study, condition, drawn_trials, judge
 from rise_agents import demonstrations
 from rise_agents.files import sweep
 from rise_envs import STAND_INS
@@ -184,7 +184,7 @@ def _recorded(
 
 
 def _jobs(trials: Mapping[Study, Iterable[int]], seeds: Iterable[int], out: Path, every: float) -> list[Job]:
-    """Train and judge; settings that two trials share are trained once."""
+    """Train and judge; settings that two trials share are trained once, and none whose rates are there already."""
     jobs = [
         job
         for seed in seeds
@@ -192,7 +192,8 @@ def _jobs(trials: Mapping[Study, Iterable[int]], seeds: Iterable[int], out: Path
         for trial in numbers
         for job in study.jobs(trial, seed, out, every)
     ]
-    return list({job.output: job for job in jobs}.values())
+    unique = list({job.output: job for job in jobs}.values())
+    return wanted(unique, [job for job in unique if job.run is judge])
 
 
 def _run(jobs: Sequence[Job], how: How, kinds: str) -> list[Failure]:
