@@ -328,6 +328,7 @@ def test_a_table_of_trials_that_is_none_is_refused(spoil, says, tmp_path, monkey
     table = tmp_path / "known.csv"
     table.write_text(spoil((tmp_path / "trials.csv").read_text()))
     calls.clear()
+    capsys.readouterr()
     assert main([*command, "--known", str(table)]) == 2
     assert main([*command, "--known", str(tmp_path / "missing.csv")]) == 2
     error = capsys.readouterr().err
