@@ -40,7 +40,7 @@ class Job:
         arguments: its arguments.
         output: the file whose existence says that the job is done.
         needs: outputs of other jobs that must exist first.
-        weight: rough relative duration; long jobs start first.
+        weight: rough relative duration; long jobs start first where nothing else is said.
     """
 
     name: str
@@ -64,6 +64,13 @@ def checkpoint_path(plan: Plan, env: str, row: str, seed: int, out: Path) -> Pat
     source = [plan.expert_of(row), plan.demos] if imitates(agent) else []
     mark = digest(__version__, env, agent, seed, training_settings(plan, env, row), source)
     return out / "agents" / env / f"{agent}-seed{seed}-{mark}.rise"
+
+
+def checkpoint_name(plan: Plan, trained: Path, out: Path) -> str:
+    """A checkpoint as ``run.json`` names it."""
+    if plan.pretrained:
+        return f"{trained.name} of rise_agents.pretrained, SHA-256 {pretrained.sha256(trained)}"
+    return str(trained.relative_to(out))
 
 
 def complete_settings(plan: Plan, env: str, row: str) -> dict[str, Any]:
@@ -156,6 +163,38 @@ def with_events(jobs: Sequence[Job], folder: Path | None) -> list[Job]:
         return replace(job, arguments={**job.arguments, "events": events})
 
     return [told(job) if job.run is train else job for job in jobs]
+
+
+def wanted(jobs: Sequence[Job], ends: Sequence[Job]) -> list[Job]:
+    """Those of ``jobs`` that are done, that are ``ends``, or whose output a missing end needs, directly or not.
+
+    Who measures needs no training whose episodes are all there, and no demonstrations for a training that is done.
+    """
+    by_output = {job.output: job for job in jobs}
+    asked = {job.output for job in ends}
+    open_ends = [job for job in ends if not job.output.exists()]
+    while open_ends:
+        missing = {path for job in open_ends for path in job.needs if not path.exists()} - asked
+        asked |= missing
+        open_ends = [by_output[path] for path in missing if path in by_output]
+    return [job for job in jobs if job.output in asked or job.output.exists()]
+
+
+def in_turn(jobs: Sequence[Job], ends: Sequence[Job]) -> list[Job]:
+    """``jobs`` such that each of ``ends`` follows what it needs, and so on: who stops early has whole rows."""
+    by_output = {job.output: job for job in jobs}
+    ordered: dict[Path, Job] = {}
+
+    def take(path: Path) -> None:
+        job = by_output.get(path)
+        if job is not None and path not in ordered:
+            for need in job.needs:
+                take(need)
+            ordered[path] = job
+
+    for end in ends:
+        take(end.output)
+    return [*ordered.values(), *(job for job in jobs if job.output not in ordered)]
 
 
 def tidy(out: Path) -> None:

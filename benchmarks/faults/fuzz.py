@@ -78,11 +78,12 @@ _TEXTS: dict[str, tuple[str, ...]] = {
     "--device": (*NAMES, "cuda:99", "cpu:-1", "meta:x"),
     "--minari": ("", "x", "a/b", "a b/c-v0", "/", "../x-v0", "x-v", "x" * 300 + "-v0x", "\x00", "a\nb"),
     "--noise-levels": NO_NUMBER,
+    "--hours": (*NO_NUMBER, "0"),
     "--share": (*NO_NUMBER, "0", "1.01"),
     "--checkpoint-every": tuple(text for text in NO_NUMBER if text not in ("inf", "1e400")),
 }  # fmt: skip
 _WHOLE = ("--seeds", "--episodes", "--demos", "--workers", "--repeats", "--seed", "--only")
-_PATHS = ("--out", "--docs", "--config", "--tensorboard")
+_PATHS = ("--out", "--docs", "--config", "--published", "--tensorboard")
 
 Line = list[str]
 

@@ -117,6 +117,12 @@ def parser() -> Parser:
         "--write", type=Path, metavar="FILE", help="settings file that the chosen settings go into, too"
     )
     p.add_argument(
+        "--known",
+        type=Path,
+        metavar="FILE",
+        help="trials.csv of an earlier search: what it measured of the very same trials is not measured again",
+    )
+    p.add_argument(
         "--out", type=Path, default=Path("runs/tune"), metavar="DIR", help="folder (default: runs/tune)"
     )
     return p
@@ -166,6 +172,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         a = parser().parse_args(argv)
         warnings.simplefilter("ignore", DeprecationWarning)  # of libraries; their users cannot act on them
         search = search_of(a)
+        from benchmarks.tune.known import read
         from benchmarks.tune.search import (
             How,
             execute,
@@ -173,6 +180,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         )  # only now: it imports all that work needs
 
         sets = given_sets(search)
+        earlier = read(a.known) if a.known else {}
         prepare_folder(a.out)
     except ValueError as error:
         print(f"benchmarks.tune: {error}", file=sys.stderr)
@@ -184,7 +192,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         from rise_agents.files import sole_user
         from rise_agents.workers import available_cores
 
-        how = How(a.workers or available_cores(), a.checkpoint_every, command, a.write, a.tensorboard)
+        how = How(
+            a.workers or available_cores(), a.checkpoint_every, command, a.write, a.tensorboard, earlier
+        )
         with sole_user(a.out):
             failures = execute(search, sets, a.out, how)
     except KeyboardInterrupt:

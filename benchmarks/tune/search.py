@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from benchmarks.display import Display
 from benchmarks.executors import Failure, run_jobs
-from benchmarks.jobs import Job, demonstrations_folder, recording_jobs, tidy, with_events
+from benchmarks.jobs import Job, demonstrations_folder, recording_jobs, tidy, wanted, with_events
+from benchmarks.labels import count
 from benchmarks.protocol import Plan, imitates
-from benchmarks.tune import report
+from benchmarks.tune import known, report
 from benchmarks.tune.ranking import Rates, best_clean, finalists, mean, ranked
-from benchmarks.tune.studies import Study, condition, drawn_trials
+from benchmarks.tune.studies import Study, condition, drawn_trials, judge
 from rise_agents import demonstrations
 from rise_agents.files import sweep
 from rise_envs import STAND_INS
@@ -79,6 +81,7 @@ class How:
         command: how it was started, for the comments of settings files.
         write: a settings file that the chosen settings go into, beside the one in the folder.
         tensorboard: folder for event files of the trainings; None: none are written.
+        known: lines of an earlier search's table, by the name of their result.
     """
 
     workers: int
@@ -86,6 +89,7 @@ class How:
     command: tuple[str, ...]
     write: Path | None = None
     tensorboard: Path | None = None
+    known: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
 
 
 def given_sets(search: Search) -> dict[str, tuple[Path, str]]:
@@ -130,6 +134,9 @@ def execute(search: Search, sets: Mapping[str, tuple[Path, str]], out: Path, how
         for agent, env in search.pairs()
         if env in sources or not imitates(agent)
     ]
+    if how.known:
+        taken = known.recall(studies, search.plan.seeds, how.known, out)
+        print(f"taken from an earlier search: {count([taken], 'result')}", file=sys.stderr)
     first = {study: range(len(study.trials)) for study in studies}
     failures += _run(_jobs(first, [0], out, how.every), how, "first round: train, judge")
     rates = {study: _measured(study, first[study], [0], out) for study in studies}
@@ -186,7 +193,7 @@ def _recorded(
 
 
 def _jobs(trials: Mapping[Study, Iterable[int]], seeds: Iterable[int], out: Path, every: float) -> list[Job]:
-    """Train and judge; settings that two trials share are trained once."""
+    """Train and judge; settings that two trials share are trained once, and none whose rates are there already."""
     jobs = [
         job
         for seed in seeds
@@ -194,7 +201,8 @@ def _jobs(trials: Mapping[Study, Iterable[int]], seeds: Iterable[int], out: Path
         for trial in numbers
         for job in study.jobs(trial, seed, out, every)
     ]
-    return list({job.output: job for job in jobs}.values())
+    unique = list({job.output: job for job in jobs}.values())
+    return wanted(unique, [job for job in unique if job.run is judge])
 
 
 def _run(jobs: Sequence[Job], how: How, kinds: str) -> list[Failure]:
