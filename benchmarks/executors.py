@@ -27,8 +27,18 @@ def _work(tell: Callable[..., None], job: Job) -> None:
     job.run(job.output, tell, **job.arguments)
 
 
+def never() -> bool:
+    """No time limit."""
+    return False
+
+
 def run_jobs(
-    jobs: Sequence[Job], workers: int, watch: Watcher, say: Callable[[str], None] = lambda line: None
+    jobs: Sequence[Job],
+    workers: int,
+    watch: Watcher,
+    say: Callable[[str], None] = lambda line: None,
+    time_is_up: Callable[[], bool] = never,
+    longest_first: bool = True,
 ) -> list[Failure]:
     """Run all jobs whose output is missing; those that need a failed job's output are not run.
 
@@ -37,14 +47,19 @@ def run_jobs(
         workers: processes.
         watch: told of progress.
         say: told, in one line, when a worker process has died or a job has failed.
+        time_is_up: asked about once a second; when it is, what runs is interrupted and nothing more is started.
+        longest_first: start the longest job first of those that can start, else the first in ``jobs``.
 
     Returns:
-        What failed. A failure stops nothing but the jobs that depend on it.
+        What failed. A failure stops nothing but the jobs that depend on it. Jobs whose output is missing, but which
+        did not fail, were left when time was up.
     """
     for job in jobs:
         if job.output.exists():
             watch(job, 1.0, {})
-    pending = sorted((job for job in jobs if not job.output.exists()), key=lambda job: -job.weight)
+    pending = [job for job in jobs if not job.output.exists()]
+    if longest_first:
+        pending.sort(key=lambda job: -job.weight)
     if not pending:
         return []
 
@@ -52,7 +67,7 @@ def run_jobs(
         watch(pending[number], min(share, 0.999), figures)  # only its end makes it whole
 
     with Pool(min(workers, len(pending)), listen) as pool:
-        return _Schedule(pool, pending, watch, say).run()
+        return _Schedule(pool, pending, watch, say).run(time_is_up)
 
 
 class _Schedule:
@@ -64,8 +79,8 @@ class _Schedule:
         self.deaths = Counter[int]()
         self.failures: list[Failure] = []
 
-    def run(self) -> list[Failure]:
-        while self.waiting or self.pool.busy:
+    def run(self, time_is_up: Callable[[], bool]) -> list[Failure]:
+        while (self.waiting or self.pool.busy) and not time_is_up():
             ready = [n for n, job in self.waiting.items() if all(path.exists() for path in job.needs)]
             for number in ready[: self.pool.free]:
                 self.pool.start(number, _work, self.waiting.pop(number))

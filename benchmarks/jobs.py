@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,11 +19,12 @@ from benchmarks.labels import TRUE, agent_label, split_row
 from benchmarks.policies import make_policy
 from benchmarks.protocol import Plan, Scenarios, digest, imitates
 from benchmarks.videos import record
-from rise_agents import __version__, agent_class, checkpoint, demonstrations, make_agent, pretrained
+from rise_agents import __version__, agent_class, checkpoint, demonstrations, figures, make_agent, pretrained
 from rise_agents.agent import Progress, acting_settings, config_to_dict, make_config
 from rise_agents.demonstrations import recording
 from rise_agents.resume import Resume
 from rise_agents.rollout import rollout
+from rise_envs.task import describes_task, env_class
 
 _Actor = tuple[list[Any], dict[str, Any]]  # see _actor
 PARTS = "parts"  # folder for the pieces of demonstrations that are being recorded
@@ -39,7 +40,7 @@ class Job:
         arguments: its arguments.
         output: the file whose existence says that the job is done.
         needs: outputs of other jobs that must exist first.
-        weight: rough relative duration; long jobs start first.
+        weight: rough relative duration; long jobs start first where nothing else is said.
     """
 
     name: str
@@ -63,6 +64,13 @@ def checkpoint_path(plan: Plan, env: str, row: str, seed: int, out: Path) -> Pat
     source = [plan.expert_of(row), plan.demos] if imitates(agent) else []
     mark = digest(__version__, env, agent, seed, training_settings(plan, env, row), source)
     return out / "agents" / env / f"{agent}-seed{seed}-{mark}.rise"
+
+
+def checkpoint_name(plan: Plan, trained: Path, out: Path) -> str:
+    """A checkpoint as ``run.json`` names it."""
+    if plan.pretrained:
+        return f"{trained.name} of rise_agents.pretrained, SHA-256 {pretrained.sha256(trained)}"
+    return str(trained.relative_to(out))
 
 
 def complete_settings(plan: Plan, env: str, row: str) -> dict[str, Any]:
@@ -145,6 +153,50 @@ def training_jobs(plan: Plan, out: Path, device: str, every: float) -> list[Job]
     return list(jobs.values())
 
 
+def with_events(jobs: Sequence[Job], folder: Path | None) -> list[Job]:
+    """The same jobs, trainings among them writing event files: into ``folder``, one folder in it each; None: none."""
+    if folder is None:
+        return list(jobs)
+
+    def told(job: Job) -> Job:
+        events = folder / job.arguments["env"] / job.output.stem
+        return replace(job, arguments={**job.arguments, "events": events})
+
+    return [told(job) if job.run is train else job for job in jobs]
+
+
+def wanted(jobs: Sequence[Job], ends: Sequence[Job]) -> list[Job]:
+    """Those of ``jobs`` that are done, that are ``ends``, or whose output a missing end needs, directly or not.
+
+    Who measures needs no training whose episodes are all there, and no demonstrations for a training that is done.
+    """
+    by_output = {job.output: job for job in jobs}
+    asked = {job.output for job in ends}
+    open_ends = [job for job in ends if not job.output.exists()]
+    while open_ends:
+        missing = {path for job in open_ends for path in job.needs if not path.exists()} - asked
+        asked |= missing
+        open_ends = [by_output[path] for path in missing if path in by_output]
+    return [job for job in jobs if job.output in asked or job.output.exists()]
+
+
+def in_turn(jobs: Sequence[Job], ends: Sequence[Job]) -> list[Job]:
+    """``jobs`` such that each of ``ends`` follows what it needs, and so on: who stops early has whole rows."""
+    by_output = {job.output: job for job in jobs}
+    ordered: dict[Path, Job] = {}
+
+    def take(path: Path) -> None:
+        job = by_output.get(path)
+        if job is not None and path not in ordered:
+            for need in job.needs:
+                take(need)
+            ordered[path] = job
+
+    for end in ends:
+        take(end.output)
+    return [*ordered.values(), *(job for job in jobs if job.output not in ordered)]
+
+
 def tidy(out: Path) -> None:
     """Remove what a kill in the last lines of a job left: states of finished trainings, pieces of finished sets."""
     for state in out.glob("agents/*/*.training"):
@@ -208,7 +260,7 @@ def video_jobs(plan: Plan, out: Path) -> list[Job]:
     for env in plan.envs:
         asked = plan.described()[0]["rows"]
         for row, seed in plan.rows(env):
-            if seed or row not in asked:
+            if seed or row not in asked or "rgb_array" not in env_class(env).metadata["render_modes"]:
                 continue
             level = 0.0 if split_row(row)[1] == TRUE else headline
             source, arguments = _actor(plan, env, row, 0, out)
@@ -236,7 +288,9 @@ def check_settings(plan: Plan) -> None:
         for row, seed in plan.rows(env):
             if seed == 0 and plan.agent_of(row):
                 try:
-                    complete_settings(plan, env, row)
+                    settings = complete_settings(plan, env, row)
+                    if not describes_task(env):  # an agent says itself whether it can do without
+                        make_agent(plan.agent_of(row), env, settings)
                 except (TypeError, ValueError, checkpoint.CheckpointError) as error:
                     raise ValueError(f"settings of {split_row(row)[0]}: {error}") from None
 
@@ -262,11 +316,16 @@ def train(
     data: Path | None,
     device: str,
     every: float,
+    events: Path | None = None,
 ) -> None:
-    """Train one agent, from where it was interrupted; writes its checkpoint and a JSON record of the training."""
+    """Train one agent, from where it was interrupted; writes its checkpoint and a JSON record of the training.
+
+    With ``events``, its figures also go to event files in that folder, see :mod:`rise_agents.figures`.
+    """
     resume = Resume(output.with_suffix(".training"), every)
     learner = make_agent(agent, env, config, seed, device)
-    learner.learn(env if data is None else demonstrations.load(data), progress, resume)
+    with figures.written(events, resume, progress) as tell:
+        learner.learn(env if data is None else demonstrations.load(data), tell, resume)
     record = {"seconds": round(resume.seconds, 1), "device": device, "curve": resume.curve}
     results.atomic_write_text(output.with_suffix(".json"), json.dumps(record) + "\n")
     learner.save(output)

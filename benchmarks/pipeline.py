@@ -5,28 +5,34 @@ from __future__ import annotations
 import json
 import platform
 import shlex
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks import report, results
+from benchmarks import published, report, results
 from benchmarks.display import Display
-from benchmarks.executors import Failure, run_jobs
+from benchmarks.executors import Failure, never, run_jobs
 from benchmarks.jobs import (
     Job,
+    checkpoint_name,
     checkpoint_path,
     complete_settings,
     demonstrations_folder,
     evaluation_jobs,
+    in_turn,
     recording_jobs,
     tidy,
     training_jobs,
     video_jobs,
+    wanted,
+    with_events,
 )
 from benchmarks.labels import name_rows, split_row
 from benchmarks.protocol import Plan, imitates
+from benchmarks.published import Published
 from benchmarks.sections import sections
-from rise_agents import checkpoint, demonstrations, pretrained
+from rise_agents import checkpoint, demonstrations
 from rise_agents.files import sweep
 
 
@@ -40,6 +46,9 @@ class How:
         videos: whether to draw clips.
         every: seconds between two checkpoints of a training.
         command: how this run was started, for ``run.json``.
+        tensorboard: folder for event files of the trainings; None: none are written.
+        source: published results from which episodes are taken instead of running them.
+        time_is_up: whether to interrupt what runs, and to start nothing more.
     """
 
     workers: int
@@ -47,34 +56,62 @@ class How:
     videos: bool = True
     every: float = 15.0
     command: tuple[str, ...] = ()
+    tensorboard: Path | None = None
+    source: Published | None = None
+    time_is_up: Callable[[], bool] = never
 
 
-def execute(plan: Plan, out: Path, how: How) -> list[Failure]:
-    """Do all that the plan asks for and is not done yet, in the run folder ``out``.
+@dataclass(frozen=True)
+class Outcome:
+    """How a run ended; if not everything is done, tables and figures show what there is.
 
-    Returns:
-        What failed; tables and figures then show what there is.
+    Attributes:
+        failures: what failed.
+        left: the jobs that are not done, those that failed among them.
     """
+
+    failures: list[Failure]
+    left: list[Job]
+
+    @property
+    def stopped(self) -> bool:
+        """Whether time was up before everything had been tried."""
+        failed = {failure.job.output for failure in self.failures}
+        return any(job.output not in failed for job in self.left)
+
+
+def execute(plan: Plan, out: Path, how: How) -> Outcome:
+    """Do all that the plan asks for and is not done yet, in the run folder ``out``, as far as time allows."""
     for folder in [out, *(path for path in out.rglob("*") if path.is_dir())]:
         sweep(folder)
     tidy(out)
     name_rows({name: variant.label for name, variant in plan.variants.items() if variant.label})
     with Display() as display:
         evaluations = evaluation_jobs(plan, out)
-        jobs = [*recording_jobs(plan, out), *training_jobs(plan, out, how.device, how.every), *evaluations]
-        jobs += video_jobs(plan, out) if how.videos else []
+        found = published.matches(how.source, plan, out, evaluations) if how.source else []
+        if how.source:
+            display.say(published.take(how.source, found))
+        ends = [*evaluations, *(video_jobs(plan, out) if how.videos else [])]
+        before = [*recording_jobs(plan, out), *training_jobs(plan, out, how.device, how.every)]
+        jobs = wanted([*before, *ends], ends)
         display.plan(jobs)
-        failures = run_jobs(jobs, how.workers, display.watch, display.say)
+        # All workers stay busy to the end if long jobs start first; rows are whole as soon as can be if they do not.
+        limited = how.time_is_up is not never
+        turn = with_events(in_turn(jobs, ends) if limited else jobs, how.tensorboard)
+        failures = run_jobs(turn, how.workers, display.watch, display.say, how.time_is_up, not limited)
+    # Asked again: pieces of a set of demonstrations are gone, and not needed, as soon as it is put together.
+    outcome = Outcome(failures, [job for job in wanted(jobs, ends) if not job.output.exists()])
     _write_failures(out / "failures.log", failures)
-    _write_run(plan, out, how, failures)
+    _write_run(plan, out, how, outcome, how.source if found else None)
     _write_results(out, evaluations)
-    return failures
+    return outcome
 
 
 def _write_results(out: Path, evaluations: list[Job]) -> None:
     """Everything that is computed from the rows of episodes."""
     parts = [job.output for job in evaluations if job.output.exists()]
     if not parts:
+        (out / report.EPISODES).unlink(missing_ok=True)  # of an earlier plan, which run.json no longer tells
         return
     rows = results.merge(parts, out / report.EPISODES)
     run = report.read_run(out)
@@ -114,29 +151,31 @@ def _trained(plan: Plan, out: Path) -> dict[str, dict[str, Any]]:
     return facts
 
 
-def _told(trained: Path, plan: Plan, out: Path) -> str:
-    """A checkpoint as ``run.json`` names it."""
-    if plan.pretrained:
-        return f"{trained.name} of rise_agents.pretrained, SHA-256 {pretrained.sha256(trained)}"
-    return str(trained.relative_to(out))
-
-
 def _trained_rows(plan: Plan, env: str) -> list[str]:
     """The rows of trained agents, each once; what stands before one (a filter) makes it no other agent."""
     bases = dict.fromkeys(split_row(row)[0] for row, _ in plan.rows(env))
     return [base for base in bases if plan.agent_of(base)]
 
 
-def _write_run(plan: Plan, out: Path, how: How, failures: list[Failure]) -> None:
-    """``run.json``: all that is needed to repeat the run."""
+def _cards(plan: Plan, out: Path, source: Published | None) -> dict[str, Any]:
+    """What is known of the demonstrations of each environment, recorded here or for what was published."""
     cards = {}
     for env in plan.envs:
-        recorded = () if plan.pretrained else dict.fromkeys((plan.expert, *plan.experts(env)))
-        for expert in recorded:
+        asked = () if plan.pretrained else dict.fromkeys((plan.expert, *plan.experts(env)))
+        for expert in asked:
             folder = demonstrations_folder(plan, env, out, expert)
+            card = None
             if all((folder / name).exists() for name in (demonstrations.DATA, demonstrations.CARD)):
                 card = json.loads((folder / demonstrations.CARD).read_text())
+            elif source and expert in plan.experts(env):
+                card = source.card(env, expert, plan.demos)
+            if card is not None:
                 cards[env if expert == plan.expert else f"{env} by {expert}"] = card
+    return cards
+
+
+def _write_run(plan: Plan, out: Path, how: How, outcome: Outcome, source: Published | None) -> None:
+    """``run.json``: all that is needed to repeat the run; ``source``: published results that are a part of it."""
     run = {
         "command": shlex.join(how.command),
         "plan": asdict(plan),
@@ -148,12 +187,13 @@ def _write_run(plan: Plan, out: Path, how: How, failures: list[Failure]) -> None
         "device": how.device,
         "failed": [
             {"job": f.job.name, "output": str(f.job.output.relative_to(out)), "reason": f.reason}
-            for f in failures
+            for f in outcome.failures
         ],
-        "demonstrations": cards,
+        "unfinished": len(outcome.left),
+        "demonstrations": _cards(plan, out, source),
         "agents": {
             env: {
-                f"{row}-seed{seed}": _told(checkpoint_path(plan, env, row, seed, out), plan, out)
+                f"{row}-seed{seed}": checkpoint_name(plan, checkpoint_path(plan, env, row, seed, out), out)
                 for row, seed in plan.rows(env)
                 if plan.agent_of(row)
             }
@@ -162,6 +202,7 @@ def _write_run(plan: Plan, out: Path, how: How, failures: list[Failure]) -> None
         "rows": list(dict.fromkeys(row for env in plan.envs for row, _ in plan.rows(env))),
         "blocks": plan.described(),
         "training": _trained(plan, out),
+        "taken_from": source.origin() if source else [],
         "versions": checkpoint.versions(),
         "python": platform.python_version(),
         "platform": platform.platform(),

@@ -14,8 +14,9 @@ from rise_agents.agent import State, draw_state, fresh_state
 from rise_agents.cloning import ActionUnits
 from rise_agents.experts import make_expert
 from rise_agents.filters import FILTERS, make_filter
-from rise_agents.readings import as_batch
+from rise_agents.readings import checked_parts, observation_ranks
 from rise_envs import streams
+from rise_envs.task import env_class
 
 
 class Random:
@@ -24,7 +25,10 @@ class Random:
     evaluate_deterministic = False
 
     def __init__(self, env_id: str) -> None:
-        self.units = ActionUnits.of(env_id)
+        self.units, self.ranks = (
+            ActionUnits.of(env_id),
+            observation_ranks(env_class(env_id)().observation_space),
+        )
 
     def initial_state(self, keys: NDArray[np.uint64]) -> State:
         """Streams for episodes with the given keys (B,)."""
@@ -34,8 +38,8 @@ class Random:
         self, observation: Any, state: State = None, episode_start: Any = None, deterministic: bool = False
     ) -> tuple[NDArray[np.float32], State]:
         """Actions (B, A), or (A,) for one observation."""
-        batch, single = as_batch(observation)
-        rows = len(batch["desired_goal"])
+        parts, single = checked_parts(observation, self.ranks)
+        rows = len(next(iter(parts.values())))
         keys, counter = draw_state(state, episode_start, rows, np.random.default_rng(0))
         size = len(self.units.low)
         draws = counter[:, None] * np.uint64(size) + np.arange(size, dtype=np.uint64)

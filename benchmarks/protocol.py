@@ -26,7 +26,7 @@ from rise_agents.rollout import is_batched_env
 from rise_agents.seeds import RUNS, episode_seeds
 from rise_envs import ENVS
 from rise_envs.noise import make_noise
-from rise_envs.task import task_of
+from rise_envs.task import describes_task, task_of
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class Plan:
     def __post_init__(self) -> None:
         for env in (*self.envs, *(env for block in self.blocks for env in block.envs)):
             _known("environment", env, ENVS)
-        _known("expert", self.expert, sorted({name for env in ENVS for name in expert_names(env)}))
+        _known("expert", self.expert, sorted({name for _, name in EXPERTS}))
         _whole("episodes", self.episodes, 1, 1_000_000)
         _whole("demos", self.demos, 1, 500_000)
         for block in self.all_blocks():
@@ -102,7 +102,8 @@ class Plan:
             if not 0 <= level < float("inf"):
                 raise ValueError(f"noise levels must be finite and not negative, got {level}")
         for model, env in itertools.product(block.noise_models, self._envs(block)):
-            make_noise(model, groups=task_of(env).noise_channels)
+            # Without a task, the environment itself names its groups: the wrapper asks it.
+            make_noise(model, groups=task_of(env).noise_channels if describes_task(env) else None)
         if self.pretrained and block.seeds != 1:
             raise ValueError(
                 "agents that come with the package are trained: there is one training seed of each"
@@ -118,12 +119,14 @@ class Plan:
 
     def _check_sources(self, name: str, block: Block) -> None:
         """Raise ``ValueError`` unless a row has an environment, and there what it learns from or consists of."""
-        base, _ = split_row(name)
+        base, filtered = split_row(name)
         envs = [env for env in self._envs(block) if self._takes_part(base, env)]
         if not envs:
             theirs = ", ".join(self.variants[base].envs)
             raise ValueError(f"variant {base!r} is for {theirs} only, which is not among the environments")
         for env in envs:
+            if filtered in FILTERS:
+                task_of(env)  # a filter reads it
             if self.pretrained and self.agent_of(base):
                 self.shipped(base, env)
             elif base == "expert" or self.learns_from_expert(base):

@@ -21,21 +21,29 @@ _EXAMPLES = f"""\
 examples:
   python -m benchmarks.publish runs/paper                  into {DEFAULT_OUT.as_posix()}, where written words stay
   python -m benchmarks.publish runs/paper --out results    into another folder
+  python -m benchmarks.publish runs/paper --partial        what there is of a run that is not finished
   python -m benchmarks.publish docs/results --check        whether what is published follows from its episodes
 """
 
 
-def publish(run: Path, out: Path) -> None:
+def publish(run: Path, out: Path, partial: bool = False) -> None:
     """Write the results of the run folder ``run`` to ``out``: episodes, record, tables, figures and page.
 
     All tables, figures and blocks of the page are computed from the episodes as they are stored there.
 
+    Args:
+        run: folder of a run.
+        out: folder to write to.
+        partial: also what there is of a run of which jobs are left or failed; its page then says so.
+
     Raises:
-        ValueError: no finished run, or a page in ``out`` that lacks a block; nothing is written then.
+        ValueError: no finished run, no episodes, or a page in ``out`` that lacks a block; nothing is written then.
         OSError: a file cannot be written.
     """
     check_page(out)
-    record = trimmed(run)
+    record = trimmed(run, partial)
+    if not (run / report.EPISODES).exists():
+        raise ValueError(f"{str(run)!r} has no episodes yet: there is nothing to publish")
     rows = results.rounded(results.read_rows(run / report.EPISODES))
     prepare_folder(out)
     for stem in (*(Path(name).stem for name in report.FIGURES), "others-"):  # this run may not have them all
@@ -47,22 +55,36 @@ def publish(run: Path, out: Path) -> None:
     renew_page(out)
 
 
-def trimmed(run: Path) -> dict[str, Any]:
+def trimmed(run: Path, partial: bool = False) -> dict[str, Any]:
     """``run.json`` of a run folder without what is of the machine alone, and with how each training ended.
 
     ``trainings`` has, per environment and checkpoint, seconds, device and the last point of the training curve.
 
+    Args:
+        run: folder of a run.
+        partial: also of a run that is not finished; ``unfinished`` says how many jobs it lacks.
+
     Raises:
-        ValueError: there is no such record, or something of the run failed.
+        ValueError: there is no such record, or jobs of the run are left or failed.
     """
     path = run / report.RECORD
-    if not report.read_run(run):
+    told = report.read_run(run)
+    if not told:
         raise ValueError(f"{path} is missing: {str(run)!r} is not the folder of a finished run")
     record = json.loads(path.read_bytes())
-    if record.get("failed"):
-        raise ValueError(f"some jobs of {str(run)!r} failed: give the run's command again first")
+    failed, left = record.get("failed") or [], told["unfinished"]
+    if (failed or left) and not partial:
+        what = (
+            f"some jobs of {str(run)!r} failed"
+            if failed
+            else f"{str(run)!r} is not finished, jobs left: {left:,}"
+        )
+        raise ValueError(
+            f"{what}: give the run's command again first, or publish what there is with --partial"
+        )
     kept = {key: value for key, value in record.items() if key not in _OF_THE_MACHINE}
     try:
+        kept["unfinished"] = max(left, len(failed))  # older records do not count what failed
         return _without_folders({**kept, "trainings": _trainings(run, record.get("agents", {}))})
     except (AttributeError, TypeError) as error:
         raise ValueError(f"{path} is not the record of a run ({error})") from None
@@ -101,6 +123,7 @@ def _without_folders(value: Any) -> Any:
 def parser() -> Parser:
     """The command line."""
     p = Parser(
+        plugins=True,
         prog="python -m benchmarks.publish",
         description="Turn a finished run into what is committed of it: episodes in few bytes, tables, figures, page.",
         epilog=_EXAMPLES,
@@ -112,6 +135,11 @@ def parser() -> Parser:
         default=DEFAULT_OUT,
         metavar="DIR",
         help=f"folder to write to (default: {DEFAULT_OUT.as_posix()})",
+    )
+    p.add_argument(
+        "--partial",
+        action="store_true",
+        help="publish what there is of a run of which jobs are left or failed; the page says so",
     )
     p.add_argument(
         "--check",
@@ -133,7 +161,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if run.resolve() == out.resolve():
             raise ValueError(f"--out is the run folder itself, {str(run)!r}: name another folder")
         with sole_user(run):
-            publish(run, out)
+            publish(run, out, arguments.partial)
     except (ValueError, OSError) as error:
         print(f"benchmarks.publish: {error}", file=sys.stderr)
         return 2 if isinstance(error, ValueError) else 1

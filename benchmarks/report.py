@@ -104,7 +104,7 @@ def summary_markdown(summary: Sequence[SummaryRow], run: Mapping[str, Any]) -> s
         run: what is known of the run: ``command`` (how to repeat it); ``training`` (name → facts of its training,
             which may be mappings themselves, such as facts per environment); ``figures`` (relative path →
             caption; pictures are shown, other files linked), by default :data:`FIGURES`; ``blocks``, which rows
-            belong together.
+            belong together; ``unfinished``: how many jobs were not done.
 
     Raises:
         ValueError: an empty summary.
@@ -112,7 +112,7 @@ def summary_markdown(summary: Sequence[SummaryRow], run: Mapping[str, Any]) -> s
     if not summary:
         raise ValueError("no results to report: the summary is empty")
     asked, *others = sections(summary, run.get("blocks", ()))
-    blocks = ["# Results", *claims(asked.rows)]
+    blocks = ["# Results", *what_is_left(run), *claims(asked.rows)]
     for path, caption in run.get("figures", FIGURES).items():
         blocks.append(f"{'!' if path.endswith('.png') else ''}[{caption}]({path})")
     blocks += ["## Tables", _MEANING + (_SEVERAL_SEEDS if several_seeds(summary) else _ONE_SEED)]
@@ -129,6 +129,15 @@ def summary_markdown(summary: Sequence[SummaryRow], run: Mapping[str, Any]) -> s
     if "command" in run:
         blocks += ["## How to repeat", f"```sh\n{run['command']}\n```"]
     return "\n\n".join(blocks) + "\n"
+
+
+def what_is_left(run: Mapping[str, Any]) -> list[str]:
+    """A sentence for pages of a run that is not finished; none for others."""
+    left = run.get("unfinished", 0)
+    if not left:
+        return []
+    pieces = f"{count([left], 'piece')} of work {'is' if left == 1 else 'are'} left"
+    return [f"**Not finished:** {pieces}, so rows can be missing, or have fewer episodes than others."]
 
 
 def claims(summary: Sequence[SummaryRow]) -> list[str]:
@@ -340,6 +349,7 @@ def read_run(folder: Path) -> dict[str, Any]:
             "rows": [str(name) for name in record.get("rows", record["plan"]["agents"])],
             "training": dict(record.get("training", {})),
             "labels": {name: str(each["label"]) for name, each in variants if each["label"]},
+            "unfinished": int(record.get("unfinished", 0)),
             "blocks": [_block(each) for each in record.get("blocks", ())],
         }
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
@@ -355,6 +365,7 @@ def _block(entry: Mapping[str, Any]) -> dict[str, Any]:
 def parser() -> Parser:
     """The command line."""
     p = Parser(
+        plugins=True,
         prog="python -m benchmarks.report",
         description="Make the tables, the figures and the page of a run again, from its episodes.",
         epilog=_EXAMPLES,
@@ -388,8 +399,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("\nbenchmarks.report: interrupted", file=sys.stderr)
         return 130
-    for env in dict.fromkeys(row.env for row in summary):
-        print(summary_table_text(sections(summary, run.get("blocks", ()))[0].rows, env))
+    asked, *_ = sections(summary, run.get("blocks", ()))
+    for env in dict.fromkeys(row.env for row in asked.rows):
+        print(summary_table_text(asked.rows, env))
     print(f"Written: {out}")
     return 0
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from benchmarks.labels import agent_label, count, env_label, interval, name_rows, noise_label, percent, sample
 from benchmarks.pages import Block, csv_text, markdown_table
-from benchmarks.report import EPISODES, claims, others_figure, read_run
+from benchmarks.report import EPISODES, claims, others_figure, read_run, what_is_left
 from benchmarks.results import atomic_write_text, read_rows
 from benchmarks.sections import Section, compared, sections
 from benchmarks.tables import ComparisonRow, SummaryRow, analyse, headline_level, read_table
@@ -28,8 +28,8 @@ _SKELETON = """\
 
 ## How to repeat
 
-The command above runs everything anew; `make results` then renews this folder. Without running anything, from the
-episodes that are here:
+The command above (without `--published` and `--hours`, if it has them) runs everything anew; `make results` then renews
+this folder. Without running anything, from the episodes that are here:
 
 ```sh
 python -m benchmarks.report docs/results --out tables   # the same CSV files, byte for byte
@@ -116,8 +116,9 @@ def stale(folder: Path) -> list[str]:
 
 
 def what_was_run(summary: Sequence[SummaryRow], run: Mapping[str, Any]) -> str:
-    """Markdown: the command, and how much was measured in each environment."""
+    """Markdown: the command, what of it is not done, and how much was measured in each environment."""
     lines = [f"```sh\n{run['command']}\n```\n"] if "command" in run else []
+    lines += [f"{sentence}\n" for sentence in what_is_left(run)]
     for env in dict.fromkeys(row.env for row in summary):
         rows = [row for row in summary if row.env == env]
         models = ", ".join(f"`{model}`" for model in dict.fromkeys(row.noise_model for row in rows))

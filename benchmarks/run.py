@@ -9,16 +9,22 @@ from __future__ import annotations
 import argparse
 import ctypes
 import json
+import math
 import sys
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from benchmarks.labels import count
 from benchmarks.presets import PRESETS
 from benchmarks.protocol import Plan, make_plan, with_filters
 from rise_agents.cli import Parser, prepare_folder
+
+if TYPE_CHECKING:
+    from benchmarks.pipeline import Outcome
+    from benchmarks.published import Published
 
 # Those of torch that can train. A name that is none of them is refused without importing torch.
 _DEVICES = ("cpu", "cuda", "hpu", "mps", "mtia", "xla", "xpu")
@@ -31,6 +37,9 @@ examples:
   python -m benchmarks.run --agents rise --set rise.beta=0.1 --out runs/beta-0.1
   python -m benchmarks.run --agents rise pcbc cppo --preset smoke     everything once, in a minute
   python -m benchmarks.run --agents rise pcbc cppo --pretrained       without training, the weights of the package
+  python -m benchmarks.run --preset paper --hours 11.5                stops in time where a job may take 12 hours
+  python -m benchmarks.run --agents rise mine --config mine.toml --preset paper --published docs/results --no-videos
+                                       what is published is taken from there: only what is new is trained and run
 
 A run that was stopped continues where it was: give the same command again.
 """
@@ -39,6 +48,7 @@ A run that was stopped continues where it was: give the same command again.
 def parser() -> Parser:
     """The command line."""
     p = Parser(
+        plugins=True,
         prog="python -m benchmarks.run",
         description="Compare agents on noisy obstacle readings: train, evaluate, tables, figures, videos.",
         epilog=_EXAMPLES,
@@ -78,6 +88,14 @@ def parser() -> Parser:
         default=[],
         metavar="NAME",
         help="for every row a second one behind this filter, for instance kalman",
+    )
+    p.add_argument(
+        "--published",
+        type=Path,
+        metavar="DIR",
+        help="take the episodes of the same agents from published results, for instance docs/results, instead of"
+        " training and running them again; with --pretrained those of the same weights. Their clips need their"
+        " training: --no-videos skips both",
     )
     p.add_argument("--seeds", type=int, metavar="N", help="training seeds per agent")
     p.add_argument(
@@ -121,6 +139,19 @@ def parser() -> Parser:
         metavar="S",
         help="seconds between two checkpoints of a training, from which it goes on if interrupted (default: 15)",
     )
+    p.add_argument(
+        "--tensorboard",
+        type=Path,
+        metavar="DIR",
+        help="write the figures of every training there as event files, which TensorBoard draws",
+    )
+    p.add_argument(
+        "--hours",
+        type=float,
+        metavar="H",
+        help="stop after so many hours: what runs is interrupted as by Ctrl-C, tables and figures show what there is,"
+        " and the same command goes on (default: when all is done)",
+    )
     p.add_argument("--no-videos", action="store_true", help="skip the clips")
     p.add_argument("--out", type=Path, metavar="DIR", help="run folder (default: runs/PRESET)")
     return p  # fmt: skip
@@ -154,8 +185,12 @@ def plan_of(arguments: argparse.Namespace) -> Plan:
         raise ValueError(f"--workers must be at least 1, got {arguments.workers}")
     if not arguments.checkpoint_every >= 0:
         raise ValueError(f"--checkpoint-every must not be negative, got {arguments.checkpoint_every}")
+    if arguments.hours is not None and not 0 < arguments.hours < math.inf:
+        raise ValueError(f"--hours must be a number above 0, got {arguments.hours:g}")
     if arguments.pretrained and (arguments.seeds or arguments.demos):
         raise ValueError("--pretrained trains nobody: leave out --seeds and --demos")
+    if arguments.tensorboard is not None:
+        prepare_events(arguments.tensorboard)
     reported = [env for env in ENVS if env not in STAND_INS]
     plan = make_plan(
         arguments.preset,
@@ -176,6 +211,26 @@ def plan_of(arguments: argparse.Namespace) -> Plan:
     check_settings(plan)
     _check_device(arguments.device)
     return plan
+
+
+def prepare_events(folder: Path) -> None:
+    """Raise ``ValueError`` unless event files can be written to a folder."""
+    from rise_agents.figures import check_installed
+
+    check_installed()
+    prepare_folder(folder)
+
+
+def _source(folder: Path | None, out: Path) -> Published | None:
+    """The published results in a folder; raises ``ValueError`` if there are none, or the run would write into them."""
+    if folder is None:
+        return None
+    from benchmarks.published import read
+
+    found = read(folder)
+    if folder.resolve() == out.resolve():
+        raise ValueError(f"--out is the folder of published results itself, {str(out)!r}: name another")
+    return found
 
 
 def _rows(arguments: argparse.Namespace) -> tuple[str, ...] | None:
@@ -214,14 +269,31 @@ def _check_device(device: str) -> None:
         raise ValueError(f"--device {device} cannot be used here: {reason}") from None
 
 
+def time_limit(
+    hours: float, started: float, clock: Callable[[], float] = time.perf_counter
+) -> Callable[[], bool]:
+    """What says whether ``hours`` have passed since ``started``, seconds of ``clock``."""
+    return lambda: clock() - started >= 3600 * hours
+
+
+def _told(outcome: Outcome, hours: float | None) -> list[str]:
+    """What was not done, a line each."""
+    lines = [f"failed: {failure.job.name}: {failure.reason}" for failure in outcome.failures]
+    if outcome.stopped:
+        left = f"{count([len(outcome.left)], 'job')} {'is' if len(outcome.left) == 1 else 'are'} left"
+        lines.append(f"stopped by --hours after {hours:g} h; {left}: give the same command again to go on")
+    return lines
+
+
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the benchmark; returns the exit code: 0 done, 1 something failed, 2 bad arguments, 130 interrupted."""
+    """Run the benchmark; returns the exit code: 0 done, 1 not all was done, 2 bad arguments, 130 interrupted."""
     started = time.perf_counter()
     try:
         arguments = parser().parse_args(argv)
         warnings.simplefilter("ignore", DeprecationWarning)  # of libraries; their users cannot act on them
         plan = plan_of(arguments)
         out = arguments.out or Path("runs") / arguments.preset
+        source = _source(arguments.published, out)
         prepare_folder(out)
     except ValueError as error:
         print(f"benchmarks.run: {error}", file=sys.stderr)
@@ -230,6 +302,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 130
     command = ("python", "-m", "benchmarks.run", *(sys.argv[1:] if argv is None else argv))
     try:
+        from benchmarks.executors import never
         from benchmarks.pipeline import How, execute
         from rise_agents.files import sole_user
         from rise_agents.workers import available_cores
@@ -240,9 +313,12 @@ def main(argv: Sequence[str] | None = None) -> int:
             videos=not arguments.no_videos,
             every=arguments.checkpoint_every,
             command=command,
+            tensorboard=arguments.tensorboard,
+            source=source,
+            time_is_up=never if arguments.hours is None else time_limit(arguments.hours, started),
         )
         with sole_user(out):
-            failures = execute(plan, out, how)
+            outcome = execute(plan, out, how)
     except KeyboardInterrupt:
         print(
             "\nbenchmarks.run: interrupted; what is finished is kept, run the command again to go on",
@@ -252,10 +328,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (OSError, ValueError) as error:
         print(f"benchmarks.run: {error}", file=sys.stderr)
         return 1
-    for failure in failures:
-        print(f"benchmarks.run: failed: {failure.job.name}: {failure.reason}", file=sys.stderr)
-    print(f"{'Finished' if not failures else 'Stopped'} after {time.perf_counter() - started:.0f} s: {out}")
-    return 1 if failures else 0
+    lines = _told(outcome, arguments.hours)
+    for line in lines:
+        print(f"benchmarks.run: {line}", file=sys.stderr)
+    print(f"{'Stopped' if lines else 'Finished'} after {time.perf_counter() - started:.0f} s: {out}")
+    return 1 if lines else 0
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ from rise_agents.agent import Progress, initial_state
 from rise_agents.files import replace_file, replacing
 from rise_agents.rollout import policy_keys
 from rise_envs.noise_wrappers import ObservationNoise
+from rise_envs.task import describes_task, task_of
 
 Frame = NDArray[np.uint8]
 FRAMES_PER_SECOND = 10
@@ -39,7 +40,7 @@ class Clip:
 def film(policy: Any, env_id: str, seed: int, noise_model: str, noise_level: float) -> Clip:
     """Draw the episode that ``seed`` names, with the noise that the benchmark gives it."""
     env: gym.Env = gym.make(env_id, render_mode="rgb_array")
-    dt = env.unwrapped.task().dt  # type: ignore[attr-defined]
+    dt = task_of(env_id).dt if describes_task(env_id) else 1.0 / env.metadata.get("render_fps", 10)
     if noise_level > 0:
         env = ObservationNoise(env, noise_model, noise_level=noise_level)
     try:

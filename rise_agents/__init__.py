@@ -6,12 +6,13 @@
 
 from __future__ import annotations
 
-import importlib
 import os
+from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
 
 from rise_agents.agent import Agent, acting_settings, config_from_dict, nearest
+from rise_envs.registry import Entry, check_new, checked_entry, checked_name, find_class
 from rise_envs.streams import checked_seed
 
 __version__ = "0.1.0"
@@ -25,6 +26,12 @@ AGENTS: dict[str, str] = {
 }
 
 
+_NEEDS = (
+    *("name", "Config", "PRESETS", "BRIEF", "learns_from", "evaluate_deterministic"),
+    *("learn", "predict", "save", "from_checkpoint"),
+)
+
+
 def agent_class(name: str) -> Any:
     """The class of a registered agent.
 
@@ -33,8 +40,31 @@ def agent_class(name: str) -> Any:
     """
     if name not in AGENTS:
         raise ValueError(f"unknown agent {name!r}: {nearest(name, AGENTS)}")
-    module, _, kind = AGENTS[name].partition(":")
-    return getattr(importlib.import_module(module), kind)
+    return find_class(AGENTS[name])
+
+
+def register_agent(name: str, entry: Entry) -> None:
+    """Add an agent to :data:`AGENTS`: command lines, benchmark and :func:`load_agent` then know it.
+
+    Args:
+        name: the ``name`` of its class.
+        entry: the class (or ``"module:Class"``), which keeps :class:`rise_agents.agent.Agent`.
+
+    Raises:
+        ValueError: a name that is malformed, taken or another one than the class says, or a class that lacks something.
+    """
+    kind = f"agent {checked_name('an agent', name, ('expert', 'random'))!r}"
+    found, text = checked_entry(kind, entry, _NEEDS)
+    check_new(kind, AGENTS.get(name), text)
+    if found.name != name:
+        raise ValueError(f"{kind}: {text!r} calls itself {found.name!r}, by which its checkpoints are found")
+    if found.learns_from not in ("demonstrations", "environment"):
+        raise ValueError(
+            f"{kind}: learns_from must be 'demonstrations' or 'environment', got {found.learns_from!r}"
+        )
+    if not is_dataclass(found.Config):
+        raise ValueError(f"{kind}: Config must be a (frozen) dataclass, got {found.Config!r}")
+    AGENTS[name] = text
 
 
 def make_agent(

@@ -233,10 +233,8 @@ class CPPO:
 
     def _ranks(self, space: spaces.Space) -> dict[str, int]:
         """Number of dimensions of each part of one observation; refuses what the frame cannot read."""
+        ranks = readings.observation_ranks(space)
         parts = space.spaces if isinstance(space, spaces.Dict) else {"": space}
-        for key, part in parts.items():
-            if not isinstance(part, spaces.Box):
-                raise ValueError(f"observation {key!r} must be a Box to be read as numbers, got {part}")
         for key, width in self._task.widths.items() if self._task is not None else ():
             given = parts[key].shape if key in parts else None
             if given != (width,):
@@ -244,7 +242,7 @@ class CPPO:
                 raise ValueError(
                     f"observation {key!r} must be ({width},), the environment's is {given}: {hint}"
                 )
-        return {key: len(part.shape or ()) for key, part in parts.items()}
+        return ranks
 
     def _inputs(self, observation: Any) -> NDArray[np.float64]:
         """Network inputs (B, K) of a batched observation, in the environment's units."""

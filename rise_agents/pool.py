@@ -18,6 +18,7 @@ from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
+from rise_agents.plugins import import_modules, imported
 from rise_agents.workers import limit_threads
 
 # Told the key of a task and whatever it had to tell.
@@ -109,7 +110,7 @@ class _Worker:
         context = multiprocessing.get_context("spawn")
         self.connection, theirs = context.Pipe()
         # Not daemonic: some tasks start processes themselves.
-        self.process = context.Process(target=_serve, args=(theirs,), daemon=False)
+        self.process = context.Process(target=_serve, args=(theirs, imported()), daemon=False)
         self.task: Any = None
         resource_tracker.ensure_running()  # which would lift the block
         with _interrupts_blocked():
@@ -173,8 +174,8 @@ def _interrupts_blocked() -> Any:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _serve(connection: Connection) -> None:
-    """A worker: does what it is given until nothing more comes."""
+def _serve(connection: Connection, modules: tuple[str, ...]) -> None:
+    """A worker: does what it is given until nothing more comes; users' ``modules`` are imported before."""
     end_with_parent()
 
     def tell(*content: Any) -> None:
@@ -186,6 +187,7 @@ def _serve(connection: Connection) -> None:
         except (EOFError, OSError):
             return
         try:
+            import_modules(modules)
             answer = {"result": function(tell, *arguments)}
         except Exception as error:  # whatever it is, the worker lives on
             answer = {"error": f"{type(error).__name__}: {error}", "trace": traceback.format_exc()}

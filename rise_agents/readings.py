@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rise_envs import streams
@@ -115,6 +116,19 @@ def checked_parts(observation: Any, ranks: Mapping[str, int]) -> tuple[dict[str,
             raise ValueError(f"{_place(key)} must have {wanted}, got shape {np.shape(parts[key])}")
     check_finite(rows)
     return rows, single
+
+
+def observation_ranks(space: spaces.Space) -> dict[str, int]:
+    """The number of dimensions of each part of one observation, as `checked_parts` takes them.
+
+    Raises:
+        ValueError: a part that is no Box.
+    """
+    parts = space.spaces if isinstance(space, spaces.Dict) else {"": space}
+    for key, part in parts.items():
+        if not isinstance(part, spaces.Box):
+            raise ValueError(f"observation {key!r} must be a Box to be read as numbers, got {part}")
+    return {key: len(part.shape or ()) for key, part in parts.items()}
 
 
 def _parts(observation: Any, keys: Mapping[str, int]) -> Mapping[str, Any]:

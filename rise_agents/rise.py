@@ -107,8 +107,8 @@ class Rise:
     SEARCH: ClassVar[dict[str, Space]] = {
         EVERYWHERE: {
             **cloning.SEARCH,
-            "latent": Choice((3, 5, 8)),
-            "beta": LogRange(0.02, 0.3),  # less does as PC-BC, more costs too much on true readings
+            "latent": Choice((5, 8)),
+            "beta": LogRange(0.01, 0.1),  # less does as PC-BC, more costs too much on true readings
             "n_samples": Choice((4, 8)),
             "average": Choice((1, 16)),
         }

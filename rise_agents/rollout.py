@@ -131,6 +131,7 @@ def rollout(
         while (episode < total).any():
             action, state = policy.predict(observation, state, starts, deterministic)
             after, reward, terminated, truncated, infos = env.step(action)
+            _check_infos(env_id, infos)
             tally.note(episode, reward, infos)
             starts = terminated | truncated
             log.note(episode, observation, action, reward, infos["cost"], after, starts)
@@ -149,6 +150,13 @@ def rollout(
     finally:
         env.close()
     return tally.episodes(), log.transitions(total)
+
+
+def _check_infos(env_id: str, infos: dict[str, Any]) -> None:
+    """Raise ``ValueError`` unless the infos of a step say all that episodes are judged by."""
+    for name in ("cost", "clearance", "is_success"):
+        if name not in infos:
+            raise ValueError(f"{env_id} gives no info[{name!r}], by which episodes are judged")
 
 
 class _Tally:

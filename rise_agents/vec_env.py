@@ -18,6 +18,7 @@ from gymnasium import spaces
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 from numpy.typing import NDArray
 
+from rise_agents.plugins import import_modules, imported
 from rise_agents.pool import end_with_parent
 from rise_envs.cost import checked_cost, cost_of
 
@@ -37,14 +38,15 @@ def make_training_env(env_id: str, num_envs: int, **kwargs: Any) -> VectorEnv:
             autoreset_mode=AutoresetMode.SAME_STEP,
             **kwargs,
         )
-    makers = [partial(_make, env_id, kwargs)] * num_envs
+    makers = [partial(_make, env_id, kwargs, imported())] * num_envs
     if num_envs == 1 or multiprocessing.current_process().daemon:
         return SyncVectorEnv(makers, autoreset_mode=AutoresetMode.SAME_STEP)
     return AsyncVectorEnv(makers, autoreset_mode=AutoresetMode.SAME_STEP)
 
 
-def _make(env_id: str, kwargs: dict[str, Any]) -> gym.Env:
+def _make(env_id: str, kwargs: dict[str, Any], modules: tuple[str, ...]) -> gym.Env:
     end_with_parent()  # a sub-environment's process would wait for ever for one that was killed
+    import_modules(modules)
     return gym.make(env_id, **kwargs)
 
 

@@ -166,6 +166,7 @@ class GroundVehicleEnv(VehicleTask, gym.Env):
 
     action_space: spaces.Box
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 10}  # noqa: RUF012
+    KEYS = (("up", "down"), ("left", "right"))  # of a keyboard, that push each action up and down
 
     def __init__(
         self,

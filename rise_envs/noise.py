@@ -35,7 +35,7 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -56,6 +56,7 @@ from rise_envs.noise_models import (
     StepNoise,
     require,
 )
+from rise_envs.registry import Entry, check_new, checked_entry, checked_name
 
 NOISE_MODELS: dict[str, Callable[..., NoiseModel]] = {
     "step": StepNoise,
@@ -66,6 +67,25 @@ NOISE_MODELS: dict[str, Callable[..., NoiseModel]] = {
     "delay": Delay,
     "quantise": Quantise,
 }
+
+
+def register_noise(name: str, entry: Entry) -> None:
+    """Give a noise model a name in texts and on command lines.
+
+    Args:
+        name: as in ``name:parameter``.
+        entry: its class (or ``"module:Class"``), made with the numbers that follow the colons.
+
+    Raises:
+        ValueError: a name that is malformed or taken, or no whole :class:`~rise_envs.noise_models.NoiseModel`.
+    """
+    kind = f"noise model {checked_name('a noise model', name)!r}"
+    found, text = checked_entry(kind, entry, ("at", "reset", "__call__"))
+    if not issubclass(found, NoiseModel):
+        raise ValueError(f"{kind}: {text!r} is no rise_envs.NoiseModel")
+    known: Any = NOISE_MODELS.get(name)
+    check_new(kind, known and f"{known.__module__}:{known.__qualname__}", text)
+    NOISE_MODELS[name] = found
 
 
 class Part(NamedTuple):

@@ -35,6 +35,7 @@ from rise_envs.rendering import (
     WARNING,
     Canvas,
     Colour,
+    lettering,
 )
 
 Array = NDArray[np.float64]
@@ -279,10 +280,9 @@ def _strip(time: float, clearance: float, as_read: bool) -> Image:
     canvas = Canvas(surface, SIZE * s / 2)  # one unit is one pixel
     surface.fill(FLOOR)
     pygame.draw.line(surface, BORDER, (0, 0), (WIDTH * s, 0), s)
-    font = _font()
 
     def write(text: str, x: float, colour: Colour) -> None:
-        line = font.render(text, True, colour)
+        line = lettering(text, colour)
         surface.blit(line, (x * s, (STRIP * s - line.get_height()) / 2))
 
     write(f"{time:.2f} s", 14, INK)
@@ -299,9 +299,3 @@ def _strip(time: float, clearance: float, as_read: bool) -> Image:
         canvas.dashed_ring(canvas.point(560 * s, middle), 7 * s, READING, 2.0)
         write("obstacle, as read", 574, PALE_INK)
     return canvas.array()
-
-
-@lru_cache(maxsize=1)
-def _font() -> pygame.font.Font:
-    pygame.font.init()
-    return pygame.font.Font(None, 20 * SMOOTH)

@@ -207,9 +207,18 @@ def _font() -> pygame.font.Font:
     return pygame.font.Font(None, 20 * SMOOTH)
 
 
+def lettering(text: str, colour: Colour) -> pygame.Surface:
+    """A line of text, at twice its size."""
+    try:
+        return _font().render(text, True, colour)
+    except pygame.error:  # somebody else, another environment say, has called pygame.quit() since
+        _font.cache_clear()
+        return _font().render(text, True, colour)
+
+
 def _write(canvas: Canvas, text: str, x: float, colour: Colour) -> float:
     """Write into the strip from ``x`` (px); returns where the text ends."""
-    line = _font().render(text, True, colour)
+    line = lettering(text, colour)
     canvas.surface.blit(line, (x, SMOOTH * (SIZE + STRIP / 2) - line.get_height() / 2))
     return x + line.get_width()
 
@@ -273,6 +282,11 @@ class Window:
         pygame.surfarray.blit_array(self._screen, picture.swapaxes(0, 1))
         pygame.display.flip()
         self._clock.tick(self._fps)
+
+    def name(self, title: str) -> None:
+        """Change the title."""
+        if self._screen is not None:
+            pygame.display.set_caption(title)
 
     def close(self) -> None:
         """Close the window. May be called twice."""

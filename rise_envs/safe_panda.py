@@ -94,6 +94,7 @@ class SafePandaEnv(PandaTask, gym.Env):
 
     action_space: spaces.Box
     metadata = {"render_modes": ["rgb_array"], "render_fps": 25}  # noqa: RUF012
+    KEYS = (("down", "up"), ("right", "left"), ("w", "s"))  # of a keyboard: as the camera sees the axes
 
     def __init__(
         self,

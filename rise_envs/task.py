@@ -6,7 +6,6 @@ and reports read this description, so that none of them names an environment.
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,6 +14,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
+
+from rise_envs.registry import find_class
 
 Array = NDArray[np.float64]
 
@@ -93,11 +94,15 @@ def env_class(env_id: str) -> Any:
     """
     entry = gym.spec(env_id).entry_point
     if isinstance(entry, str):
-        module, _, name = entry.partition(":")
-        entry = getattr(importlib.import_module(module), name)
+        entry = find_class(entry)
     if not isinstance(entry, type):
         raise ValueError(f"environment {env_id!r}: its entry point {entry!r} is no class")
     return entry
+
+
+def describes_task(env_id: str) -> bool:
+    """Whether a registered environment publishes a task description: without one, only its numbers are known."""
+    return hasattr(env_class(env_id), "task")
 
 
 def task_of(env_id: str, **kwargs: Any) -> Task:
@@ -106,7 +111,6 @@ def task_of(env_id: str, **kwargs: Any) -> Task:
     Raises:
         ValueError: the environment publishes no task description.
     """
-    described = getattr(env_class(env_id), "task", None)
-    if described is None:
+    if not describes_task(env_id):
         raise ValueError(f"environment {env_id!r} describes no task: give its class a static method task()")
-    return described(**kwargs)
+    return env_class(env_id).task(**kwargs)

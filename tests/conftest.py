@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import sys
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import pytest
@@ -18,6 +20,28 @@ settings.load_profile("suite")
 # Windows of the environments under test open on no screen; pygame's greeting would litter the output.
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
 os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+
+
+@pytest.fixture
+def own_names(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """What a test registers and imports is gone after it."""
+    import gymnasium as gym
+
+    from rise_agents import AGENTS, plugins
+    from rise_agents.experts import EXPERTS
+    from rise_agents.filters import FILTERS
+    from rise_envs import ENVS, NOISE_MODELS, STAND_INS
+
+    registries: list[dict] = [ENVS, STAND_INS, AGENTS, EXPERTS, FILTERS, NOISE_MODELS, gym.registry]
+    before = [(known, dict(known)) for known in [*registries, plugins._IMPORTED]]
+    modules = set(sys.modules)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    yield
+    for name in {module.__name__ for module in plugins._IMPORTED.values()} - modules:
+        sys.modules.pop(name, None)
+    for known, then in before:
+        known.clear()
+        known.update(then)
 
 
 @pytest.fixture(scope="session")

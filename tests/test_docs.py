@@ -104,8 +104,9 @@ def member(file: Path, name: str) -> Any:
 
 
 @pytest.mark.parametrize("page", [p for p in PAGES if "```python" in p.read_text()], ids=page_id)
-def test_snippets_run(page, tmp_path, monkeypatch):
+def test_snippets_run(page, tmp_path, monkeypatch, own_names):
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "docs").symlink_to(DOCS)  # paths on the pages are those of the repository
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     # The page with everything but its snippets blanked: a traceback then names the line of the page.
     lines, inside = [], False

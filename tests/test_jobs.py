@@ -6,17 +6,21 @@ import numpy as np
 import pytest
 
 from benchmarks import results
+from benchmarks.executors import run_jobs
 from benchmarks.jobs import (
+    Job,
     check_settings,
     checkpoint_path,
     demonstrations_folder,
     evaluate,
     evaluation_jobs,
     how_it_acts,
+    in_turn,
     recording_jobs,
     train,
     training_jobs,
     video_jobs,
+    wanted,
 )
 from benchmarks.labels import TRUE, split_row
 from benchmarks.policies import make_policy
@@ -68,6 +72,34 @@ def test_each_expert_demonstrates_into_its_own_folder(tmp_path):
     data = {job.name: job.arguments["data"] for job in training_jobs(run, tmp_path, "cpu", 15.0)}
     assert data[f"train rise-mpc on {VEHICLE}"] == folders[1]
     assert data[f"train rise on {VEHICLE}"] == data[f"train pcbc on {VEHICLE}"] == folders[0]
+
+
+def _mark(output, progress, log):
+    with log.open("a") as file:
+        file.write(f"{output.name}\n")
+    output.touch()
+
+
+def test_in_turn_each_row_is_whole_before_the_next_begins(tmp_path):
+    log = tmp_path / "log"
+
+    def job(name, *needs, weight=1.0):
+        paths = tuple(tmp_path / need for need in needs)
+        return Job(name, _mark, {"log": log}, tmp_path / name, paths, weight)
+
+    ends = [job("test a", "train a"), job("test b", "train b"), job("test a again", "train a")]
+    before = [job("record"), job("spare"), job("train b", "record", weight=9.0), job("train a", "record")]
+    turn = in_turn([*before, *ends], ends)
+    assert sorted(each.name for each in turn) == sorted(each.name for each in [*before, *ends])
+    order = ["record", "train a", "test a", "train b", "test b", "test a again", "spare"]
+    assert [each.name for each in turn] == order
+    assert run_jobs(turn, 1, lambda job, share, figures: None, longest_first=False) == []
+    assert log.read_text().splitlines() == order
+    for each in turn:
+        each.output.unlink()
+    log.unlink()
+    assert run_jobs(turn, 1, lambda job, share, figures: None) == []
+    assert log.read_text().splitlines()[:3] == ["record", "train b", "train a"]
 
 
 def test_several_noise_models_share_level_0(tmp_path):
@@ -159,3 +191,34 @@ def test_clips_are_titled_with_the_row_s_label(tmp_path):
         job.arguments["row"]: job.arguments["label"] for job in video_jobs(plan("pcbc+kalman"), tmp_path)
     }
     assert labels == {"pcbc+kalman": "PC-BC behind a Kalman filter"}
+
+
+def test_only_what_a_missing_end_needs_is_wanted(tmp_path):
+    """Two trainings from one set of two pieces; one of the first's evaluations is missing, none of the second's."""
+
+    def job(name, *needs):
+        return Job(name, train, {}, tmp_path / name, tuple(tmp_path / each for each in needs))
+
+    before = [
+        job("piece 0"),
+        job("piece 1"),
+        job("set", "piece 0", "piece 1"),
+        job("a", "set"),
+        job("b", "set"),
+    ]
+    ends = [job("a at 0", "a"), job("a at 1", "a"), job("b at 0", "b"), job("again", "b at 0"), job("chance")]
+
+    def names():
+        return [each.name for each in wanted([*before, *ends], ends)]
+
+    assert names() == [each.name for each in [*before, *ends]]
+    for done in ("a at 0", "b at 0", "again", "chance"):
+        (tmp_path / done).touch()
+    assert names() == ["piece 0", "piece 1", "set", "a", *(each.name for each in ends)]
+    (tmp_path / "set").touch()  # whose pieces may be gone
+    assert names() == ["set", "a", *(each.name for each in ends)]
+    (tmp_path / "b").touch()  # is done, and stays in the list
+    (tmp_path / "a at 1").touch()
+    (tmp_path / "again").unlink()  # needs an end, which is there
+    assert names() == ["set", "b", *(each.name for each in ends)]
+    assert wanted(before, []) == [before[2], before[4]]

@@ -16,6 +16,7 @@ import pytest
 from hand_made import make_rows
 
 from benchmarks import publish, report, results, results_page
+from benchmarks.tables import ComparisonRow, read_table
 from rise_agents.files import sole_user
 
 PUBLISHED = Path(__file__).parents[1] / "docs" / "results"
@@ -250,6 +251,105 @@ def test_figures_of_a_former_run_go(run, published):
     assert not (published / "comparison-drift.png").exists()
 
 
+# --- a run that is not finished --------------------------------------------------------------------------------
+
+
+def unfinished(run, drop, **changes):
+    """Take the rows away for which ``drop(row)`` holds."""
+    rows = [row for row in episodes().to_pylist() if not drop(row)]
+    columns = {name: [row[name] for row in rows] for name in results.SCHEMA.names}
+    results.write_rows(run / "episodes.parquet", results.from_columns(columns))
+    (run / "run.json").write_text(json.dumps({**RECORD, **changes}))
+    return rows
+
+
+def test_an_unfinished_run_is_published_only_when_asked_for(run, tmp_path, capsys):
+    """PC-BC lacks a model, a seed at level 2, and half of its scenarios at level 1 of one seed; RISE all of level 0."""
+
+    def drop(row):
+        if row["agent"] == "rise":
+            return row["noise_level"] == 0
+        if row["noise_level"] == 2:
+            return row["train_seed"] == 1
+        return row["noise_model"] == "episode" or (
+            row["noise_level"] == 1 and row["train_seed"] == 1 and row["scenario"] >= 15
+        )
+
+    rows, out = unfinished(run, drop, unfinished=7), tmp_path / "out"
+    assert publish.main([str(run), "--out", str(out)]) == 2
+    error = capsys.readouterr().err
+    assert "is not finished, jobs left: 7" in error and "--partial" in error and error.count("\n") == 1
+    assert not out.exists()
+    assert publish.main([str(run), "--out", str(out), "--partial"]) == 0
+    assert results_page.stale(out) == [] and publish.main([str(out), "--check"]) == 0
+    page, summary = (out / "README.md").read_text(), (out / "summary.md").read_text()
+    left = "**Not finished:** 7 pieces of work are left, so rows can be missing, or have fewer episodes than others."
+    assert page.count(left) == summary.count(left) == 1
+    assert "2 rows, 30–60 episodes per row of 1–2 training seeds and condition" in page
+    assert json.loads((out / "run.json").read_text())["unfinished"] == 7
+    lines = {
+        (row.env, row.noise_model, row.noise_level): row
+        for row in read_table(out / "comparisons.csv", ComparisonRow)
+    }
+    assert {key[1:] for key in lines} == {("step", 1.0), ("step", 2.0)}  # elsewhere only one of them is
+    for key, line in lines.items():
+        safe = {
+            (row["agent"], row["train_seed"], row["scenario"]): row["safe"]
+            for row in rows
+            if (row["env"], row["noise_model"], row["noise_level"]) == key
+        }
+        # At level 2 PC-BC has one training seed, which is compared with both.
+        other = {0: 0, 1: 0} if key[2] == 2 else {0: 0, 1: 1}
+        pairs = [
+            (safe["rise", seed, n], safe["pcbc", other[seed], n])
+            for seed in (0, 1)
+            for n in range(30)
+            if ("pcbc", other[seed], n) in safe
+        ]
+        assert len(pairs) == (60 if key[2] == 2 else 45) and (line.seeds, line.scenarios) == (2, 30)
+        assert line.safety_diff == pytest.approx(np.mean([a - b for a, b in np.array(pairs, int)]), abs=1e-5)
+        assert line.safety_only_a == sum(a and not b for a, b in pairs)
+        assert line.safety_low <= line.safety_diff <= line.safety_high
+    unfinished(run, lambda row: False, unfinished=0)  # it went on to the end
+    publish.publish(run, out)
+    assert "Not finished" not in (out / "README.md").read_text()
+
+
+@pytest.mark.parametrize("asked", [["rise"], ["absent"]], ids=["in one task", "nowhere"])
+def test_an_unfinished_run_may_have_other_blocks_first(asked, run, tmp_path, capsys):
+    """What was asked for is not there yet, in one task or in both; what was measured beside it is."""
+    block = {"title": "", "rows": asked, "noise_models": ["step"], "noise_levels": [0, 1, 2], "envs": []}
+    blocks = [block, {**block, "title": "Is it PC-BC?", "rows": ["pcbc"]}]
+    gone = ("rise", ENVS[1])
+    unfinished(run, lambda row: (row["agent"], row["env"]) == gone, unfinished=2, blocks=blocks)
+    out = tmp_path / "out"
+    assert publish.main([str(run), "--out", str(out), "--partial"]) == 0
+    assert results_page.stale(out) == []
+    assert report.main([str(out), "--out", str(tmp_path / "x")]) == 0
+    assert capsys.readouterr().out.count("RISE ") == (3 if asked == ["rise"] else 0)
+    page = (out / "README.md").read_text()
+    assert page.count("Not finished") == 1 and page.count("### Is it PC-BC?") == 1
+
+
+def test_what_failed_counts_as_left(run, tmp_path):
+    """In an older record too, which does not count."""
+    failed = [{"job": "train"}, {"job": "evaluate"}]
+    unfinished(run, lambda row: row["agent"] == "pcbc", failed=failed)
+    with pytest.raises(ValueError, match=r"failed: give the run's command again .* --partial"):
+        publish.publish(run, tmp_path / "out")
+    publish.publish(run, tmp_path / "out", partial=True)
+    record = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert record["unfinished"] == 2 and "failed" not in record
+    assert "2 pieces of work are left" in (tmp_path / "out" / "README.md").read_text()
+
+
+def test_a_run_without_episodes_has_nothing_to_publish(run, tmp_path, capsys):
+    (run / "episodes.parquet").unlink()
+    (run / "run.json").write_text(json.dumps({**RECORD, "unfinished": 3}))
+    assert publish.main([str(run), "--out", str(tmp_path / "out"), "--partial"]) == 2
+    assert "has no episodes yet" in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
 # --- what does not agree ---------------------------------------------------------------------------------------
 
 
@@ -315,6 +415,7 @@ def test_what_cannot_be_published_ends_in_one_line(run, tmp_path, capsys):
     for changes, says in (
         ({"failed": [{"job": "train"}]}, "failed: give the run's command again"),
         ({"plan": 3}, "not the record of a run"),
+        ({"unfinished": "some"}, "not the record of a run"),
         ({"agents": [1]}, "not the record of a run"),
     ):
         (run / "run.json").write_text(json.dumps({**RECORD, **changes}))

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import shutil
 import subprocess
 import sys
+import time
 from collections import Counter
 from dataclasses import replace
 
@@ -18,9 +20,10 @@ import pytest
 from benchmarks import report, results
 from benchmarks.executors import run_jobs
 from benchmarks.jobs import Job, demonstrations_folder
+from benchmarks.pipeline import How, execute
 from benchmarks.presets import PRESETS, Block
 from benchmarks.protocol import make_plan
-from benchmarks.run import main, parser, plan_of
+from benchmarks.run import main, parser, plan_of, time_limit
 from benchmarks.tables import ComparisonRow, read_table
 from rise_agents import agent_class
 from rise_agents.files import sole_user
@@ -235,6 +238,8 @@ def test_workers_do_not_change_the_tables(run, tmp_path):
         (["--demos", "0"], "demos must be"),
         (["--seeds", "0"], "seeds must be"),
         (["--workers", "0"], "--workers must be"),
+        (["--hours", "0"], "--hours must be a number above 0"),
+        (["--hours", "nan"], "--hours must be a number above 0"),
         (["--set", "rise.betta=1"], "did you mean 'beta'"),
         (["--set", "rise.beta=-1"], "beta must not be negative"),
         (["--set", "rise.beta=large"], "beta"),
@@ -354,3 +359,77 @@ def test_failures_end_in_exit_code_1_and_are_recorded(tmp_path, capsys, monkeypa
     assert "DatasetError" in (tmp_path / "failures.log").read_text()
     agents = {row["agent"] for row in results.read_rows(tmp_path / "episodes.parquet").to_pylist()}
     assert agents == {"random"}
+
+
+# --- a time limit ----------------------------------------------------------------------------------------------
+
+
+def test_a_time_limit_counts_from_the_start():
+    now = [100.0]
+    time_is_up = time_limit(0.5, 100.0, lambda: now[0])
+    assert not time_is_up()
+    now[0] += 1799
+    assert not time_is_up()
+    now[0] += 1
+    assert time_is_up()
+
+
+def _wait(output, progress, pid):
+    pid.write_text(str(os.getpid()))
+    time.sleep(60)
+
+
+def test_when_time_is_up_what_runs_is_interrupted_and_nothing_more_starts(tmp_path):
+    first, pid, later = tmp_path / "first", tmp_path / "pid", tmp_path / "later"
+    jobs = [
+        Job("first", _write, {"text": "1"}, first, weight=9),
+        Job("long", _wait, {"pid": pid}, tmp_path / "long", weight=5),
+        Job("later", _write, {"text": "3"}, later),
+    ]
+    up = lambda: pid.exists() and bool(pid.read_text())  # noqa: E731
+    assert run_jobs(jobs, 1, lambda job, share, figures: None, time_is_up=up) == []
+    assert first.exists() and not later.exists() and not (tmp_path / "long").exists()
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(pid.read_text()), 0)
+
+
+def test_with_no_time_nothing_is_started_but_what_there_is_is_shown(run, tmp_path, capsys):
+    """Two of six evaluations, a clip and a checkpoint are missing; then the same command without a limit."""
+    shutil.copytree(run, tmp_path / "run")
+    out, command = tmp_path / "run", [*SMALL, "--workers", "1", "--out", str(tmp_path / "run")]
+    parts = [*(out / "parts").rglob("pcbc-*.parquet")]
+    lost = [*parts, *(out / "agents").rglob("pcbc-*.rise"), *(out / "videos").glob("*-pcbc-*.mp4")]
+    for path in lost:
+        path.unlink()
+    assert (len(parts), len(lost)) == (2, 4)
+    assert main([*command, "--hours", "1e-9"]) == 1
+    printed = capsys.readouterr()
+    told = "stopped by --hours after 1e-09 h; 4 jobs are left: give the same command again to go on"
+    assert f"benchmarks.run: {told}\n" in printed.err and "Stopped after" in printed.out
+    assert json.loads((out / "run.json").read_text())["unfinished"] == 4
+    assert {row["agent"] for row in results.read_rows(out / "episodes.parquet").to_pylist()} == {
+        "rise",
+        "random",
+    }
+    assert not any(path.exists() for path in lost) and not (out / "failures.log").exists()
+    assert main(command) == 0
+    assert json.loads((out / "run.json").read_text())["unfinished"] == 0
+    for name in ("episodes.parquet", "summary.csv", "comparisons.csv"):
+        assert (out / name).read_bytes() == (run / name).read_bytes()
+
+
+def test_a_training_keeps_its_state_when_time_is_up(tmp_path):
+    """The clock stops the run as soon as the training has stored it."""
+    arguments = [*SMALL, "--agents", "pcbc", "--demos", "4", "--set", "pcbc.updates=100000"]
+    plan = plan_of(parser().parse_args(arguments))
+    state = lambda: list(tmp_path.glob("agents/*/*.training"))  # noqa: E731
+    outcome = execute(plan, tmp_path, How(1, videos=False, every=0.0, time_is_up=lambda: bool(state())))
+    assert outcome.stopped and outcome.failures == []
+    # The training and two evaluations; the demonstrations are there, their pieces gone.
+    assert sorted(job.name.split()[0] for job in outcome.left) == ["evaluate", "evaluate", "train"]
+    assert json.loads((tmp_path / "run.json").read_text())["unfinished"] == 3
+    assert state() and not (tmp_path / "episodes.parquet").exists()
+    # Nor would there be those of an earlier plan, of which run.json no longer speaks.
+    (tmp_path / "episodes.parquet").write_bytes(b"")
+    execute(plan, tmp_path, How(1, videos=False, time_is_up=lambda: True))
+    assert not (tmp_path / "episodes.parquet").exists()

@@ -281,3 +281,21 @@ def test_foreign_tables_are_refused(tmp_path, change, message):
 def test_the_headline_level_is_the_papers_or_the_nearest(levels, headline):
     rows = pa.concat_tables([make_rows(noise_level=float(level)) for level in levels])
     assert tables.headline_level(tables.summarise(rows)) == headline
+
+
+def test_agents_are_compared_where_both_have_been():
+    """Of two agents with several seeds the common one, and there the common scenarios."""
+    rows = [
+        outcomes(A, agent="rise"),
+        outcomes([B[0][:4]], agent="pcbc"),
+        outcomes([B[1]], agent="pcbc", seeds=[2]),
+    ]
+    rows.append(outcomes([[1, 1, 0]], agent="expert-cbf", start=6))  # elsewhere: compared with nobody
+    summary, (row,) = tables.analyse(pa.concat_tables(rows), ("rise", "pcbc"))
+    assert (row.agent, row.other, row.seeds, row.scenarios) == ("rise", "pcbc", 1, 4)
+    assert (row.safety_diff, row.safety_only_a, row.safety_only_b) == (3 / 4, 3, 0)
+    by_agent = {row.agent: row for row in summary}
+    assert (by_agent["pcbc"].train_seeds, by_agent["pcbc"].episodes) == (2, 10)
+    assert by_agent["pcbc"].safety_rate == 3 / 10
+    assert by_agent["expert-cbf"].safety_low == pytest.approx(float(stats.wilson(2, 3)[0]))
+    assert by_agent["expert-cbf"].against == "" and by_agent["pcbc"].against == "rise"

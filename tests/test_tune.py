@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import shutil
 import tomllib
 from pathlib import Path
 
@@ -40,7 +41,7 @@ def test_the_best_score_wins_among_those_that_see_as_well_as_the_best():
     }
     assert ranked(rates, 0.01, rates[0]) == [1, 0, 3, 2]
     assert ranked(rates, 0.02, rates[0]) == [3, 2, 1, 0]
-    assert ranked(rates, 0.0, rates[0]) == [0, 3, 2, 1]
+    assert ranked(rates, 0.0, rates[0]) == [0, 1, 3, 2]  # who loses less comes first
 
 
 def test_what_another_agent_can_do_when_it_sees_well_none_may_give_up():
@@ -50,7 +51,7 @@ def test_what_another_agent_can_do_when_it_sees_well_none_may_give_up():
         0,
         1,
     ]  # 1 is 1.5 points less safe than the other agent
-    assert ranked(rates, 0.01, Rates(1.0, 1.0, 0.1, 0.1)) == [1, 0]  # neither is eligible: by their score
+    assert ranked(rates, 0.01, Rates(1.0, 1.0, 0.1, 0.1)) == [0, 1]  # neither is eligible: 0 loses less
 
 
 def test_the_reference_is_the_best_mean_on_true_readings():
@@ -274,6 +275,64 @@ def test_the_best_mean_over_the_seeds_is_chosen_from_the_finalists(tmp_path, mon
         (trial, seed) for trial in "36" for seed in "012"
     ]
     assert len(lines) == 7 + 2 * 2 and all(json.loads(line["settings"]) in trials for line in lines)
+
+
+def test_what_has_its_rates_is_not_trained_again(tmp_path, monkeypatch):
+    run, calls = made_up(lambda settings, seed: Rates(1.0, 1.0, 0.5, 0.5))
+    monkeypatch.setattr(search, "run_jobs", run)
+    command = ["--agents", "cppo", "--envs", VEHICLE, "--trials", "4", "--out", str(tmp_path)]
+    assert main(command) == 0
+    shutil.rmtree(tmp_path / "agents")  # a search goes on from its rates alone
+    calls.clear()
+    assert main(command) == 0 and calls == []
+    command[command.index("4")] = "5"
+    assert main(command) == 0
+    assert calls == [
+        f"{do} cppo on {VEHICLE}, trial {n}, seed {s}"
+        for n, s in ((4, 0), (1, 1), (1, 2))
+        for do in ("train", "judge")
+    ]
+
+
+def test_rates_of_an_earlier_search_are_taken_for_the_very_same_trials(tmp_path, monkeypatch, capsys):
+    run, calls = made_up(lambda settings, seed: Rates(1.0, 0.9, 0.5, 0.123456 if settings else 0.4))
+    monkeypatch.setattr(search, "run_jobs", run)
+    command = ["--agents", "cppo", "--envs", VEHICLE, "--trials", "5"]
+    assert main([*command, "--out", str(tmp_path / "first")]) == 0
+    first = (tmp_path / "first" / "trials.csv").read_text()
+    calls.clear()
+    known = ["--known", str(tmp_path / "first" / "trials.csv")]
+    assert main([*command, "--out", str(tmp_path / "second"), *known]) == 0
+    assert calls == [] and (tmp_path / "second" / "trials.csv").read_text() == first
+    assert "9 results" in capsys.readouterr().err  # five trials, two of them with two more seeds
+    for other in (["--scenarios", "399"], ["--set", "cppo.gae_lambda=0.9"]):
+        calls.clear()
+        assert main([*command, "--out", str(tmp_path / other[-1]), *known, *other]) == 0
+        assert len(calls) == 2 * 9
+
+
+@pytest.mark.parametrize(
+    ("spoil", "says"),
+    [
+        (lambda text: text.replace("score", "sore"), "columns must be"),
+        (lambda text: text.replace("0.5,", "1.5,"), "line 2"),
+        (lambda text: text.replace("{}", "{"), "line 2"),
+        (lambda text: "\x00" + text, "no table of trials"),
+    ],
+)
+def test_a_table_of_trials_that_is_none_is_refused(spoil, says, tmp_path, monkeypatch, capsys):
+    run, calls = made_up(lambda settings, seed: Rates(1.0, 0.9, 0.5, 0.4))
+    monkeypatch.setattr(search, "run_jobs", run)
+    command = ["--agents", "cppo", "--envs", VEHICLE, "--trials", "1", "--out", str(tmp_path)]
+    assert main(command) == 0
+    table = tmp_path / "known.csv"
+    table.write_text(spoil((tmp_path / "trials.csv").read_text()))
+    calls.clear()
+    capsys.readouterr()
+    assert main([*command, "--known", str(table)]) == 2
+    assert main([*command, "--known", str(tmp_path / "missing.csv")]) == 2
+    error = capsys.readouterr().err
+    assert says in error and "cannot read" in error and error.count("\n") == 2 and calls == []
 
 
 def test_the_same_budget_for_everybody_and_other_tables_are_kept(tmp_path, monkeypatch):

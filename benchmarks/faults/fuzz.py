@@ -73,16 +73,17 @@ PROGRAMS = (
 # option -> texts that it must refuse
 _TEXTS: dict[str, tuple[str, ...]] = {
     "--agents": NAMES, "--envs": NAMES, "--env": NAMES, "--preset": NAMES, "--expert": NAMES, "--rows": NAMES,
-    "--filter": NAMES,
+    "--filter": NAMES, "--import": NAMES,
     "--noise-model": (*NAMES, "step+", "+step", "dropout:2", "dropout:x", "delay:-1", "step:1:2", "delay:nan"),
     "--device": (*NAMES, "cuda:99", "cpu:-1", "meta:x"),
     "--minari": ("", "x", "a/b", "a b/c-v0", "/", "../x-v0", "x-v", "x" * 300 + "-v0x", "\x00", "a\nb"),
     "--noise-levels": NO_NUMBER,
+    "--hours": (*NO_NUMBER, "0"),
     "--share": (*NO_NUMBER, "0", "1.01"),
     "--checkpoint-every": tuple(text for text in NO_NUMBER if text not in ("inf", "1e400")),
 }  # fmt: skip
 _WHOLE = ("--seeds", "--episodes", "--demos", "--workers", "--repeats", "--seed", "--only")
-_PATHS = ("--out", "--docs", "--config")
+_PATHS = ("--out", "--docs", "--config", "--published", "--tensorboard")
 
 Line = list[str]
 

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from benchmarks.run import parse_settings
+from benchmarks.run import parse_settings, prepare_events
 from rise_agents import AGENTS
 from rise_agents.cli import Parser, prepare_folder
 
@@ -30,6 +30,7 @@ A search that was stopped continues where it was: give the same command again.
 def parser() -> Parser:
     """The command line."""
     p = Parser(
+        plugins=True,
         prog="python -m benchmarks.tune",
         description="Search settings, with the same budget for each agent, on validation scenarios.",
         epilog=_EXAMPLES,
@@ -107,7 +108,19 @@ def parser() -> Parser:
         help="seconds between two checkpoints of a training, from which it goes on if interrupted (default: 15)",
     )
     p.add_argument(
+        "--tensorboard",
+        type=Path,
+        metavar="DIR",
+        help="write the figures of every training there as event files, which TensorBoard draws",
+    )
+    p.add_argument(
         "--write", type=Path, metavar="FILE", help="settings file that the chosen settings go into, too"
+    )
+    p.add_argument(
+        "--known",
+        type=Path,
+        metavar="FILE",
+        help="trials.csv of an earlier search: what it measured of the very same trials is not measured again",
     )
     p.add_argument(
         "--out", type=Path, default=Path("runs/tune"), metavar="DIR", help="folder (default: runs/tune)"
@@ -147,6 +160,8 @@ def search_of(a: argparse.Namespace) -> Search:
         search.study(agent, env)
     if a.write is not None:
         settings_file.read(a.write)
+    if a.tensorboard is not None:
+        prepare_events(a.tensorboard)
     return search
 
 
@@ -157,6 +172,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         a = parser().parse_args(argv)
         warnings.simplefilter("ignore", DeprecationWarning)  # of libraries; their users cannot act on them
         search = search_of(a)
+        from benchmarks.tune.known import read
         from benchmarks.tune.search import (
             How,
             execute,
@@ -164,6 +180,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         )  # only now: it imports all that work needs
 
         sets = given_sets(search)
+        earlier = read(a.known) if a.known else {}
         prepare_folder(a.out)
     except ValueError as error:
         print(f"benchmarks.tune: {error}", file=sys.stderr)
@@ -175,7 +192,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         from rise_agents.files import sole_user
         from rise_agents.workers import available_cores
 
-        how = How(a.workers or available_cores(), a.checkpoint_every, command, a.write)
+        how = How(
+            a.workers or available_cores(), a.checkpoint_every, command, a.write, a.tensorboard, earlier
+        )
         with sole_user(a.out):
             failures = execute(search, sets, a.out, how)
     except KeyboardInterrupt:

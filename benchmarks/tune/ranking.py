@@ -13,7 +13,7 @@ from typing import NamedTuple
 CLEAN, NOISY = 0.0, 1.0  # the noise levels that settings are judged at
 MODEL = "step"
 KEPT = 4  # one in so many settings goes on to the second round
-_ROUNDING = 1e-9  # rates are quotients: 0.99 - 0.98 is not 0.01
+_DIGITS = 9  # of losses that matter: rates are quotients, and 0.99 - 0.98 is not 0.01
 
 
 class Rates(NamedTuple):
@@ -53,8 +53,9 @@ def ranked(rates: Mapping[int, Rates], clean_loss: float, best: Rates) -> list[i
     """Trials, best first.
 
     Those come first whose rates on true readings are both at most ``clean_loss`` below those of ``best``; among them
-    the higher score is better. The others follow, by their score, too. Of equal trials the one with the lower number is
-    better: trial 0 has the agent's defaults.
+    the higher score is better. The others follow, who lose less before who lose more (the feasibility rule of Deb,
+    "An efficient constraint handling method for genetic algorithms", 2000). Of equal trials the one with the lower
+    number is better: trial 0 has the agent's defaults.
 
     Args:
         rates: of each trial of one round, by its number.
@@ -63,11 +64,12 @@ def ranked(rates: Mapping[int, Rates], clean_loss: float, best: Rates) -> list[i
             it sees well no other one may give up for robustness.
     """
 
-    def loses(rate: Rates) -> bool:
+    def excess(rate: Rates) -> float:
+        """How much more is lost than may be."""
         loss = max(best.clean_safety - rate.clean_safety, best.clean_reach - rate.clean_reach)
-        return loss > clean_loss + _ROUNDING
+        return round(max(loss - clean_loss, 0.0), _DIGITS)
 
-    return sorted(rates, key=lambda n: (loses(rates[n]), -rates[n].score, n))
+    return sorted(rates, key=lambda n: (excess(rates[n]), -rates[n].score, n))
 
 
 def finalists(rates: Mapping[int, Rates], clean_loss: float, best: Rates, trials: int) -> list[int]:

@@ -20,7 +20,7 @@ from rise_agents.agent import config_to_dict, make_config
 
 COLUMNS = (
     *("agent", "env", "trial", "train_seed", "settings", "clean_safety", "clean_reach", "safety", "reach"),
-    *("score", "training_seconds"),
+    *("score", "training_seconds", "result"),
 )
 
 
@@ -129,6 +129,7 @@ def write_trials(path: Path, studies: Sequence[Study], seeds: int, out: Path) ->
                 line = {"agent": study.agent, "env": study.env, "trial": trial, "train_seed": seed}
                 line |= {"settings": json.dumps(study.trials[trial], sort_keys=True)}
                 line |= {name: f"{rate:.6g}" for name, rate in rates._asdict().items()}
-                seconds = read_result(study.result(trial, seed, out))["training_seconds"]
-                writer.writerow({**line, "score": f"{rates.score:.6g}", "training_seconds": seconds})
+                result = study.result(trial, seed, out)
+                line |= {"training_seconds": read_result(result)["training_seconds"], "result": result.name}
+                writer.writerow({**line, "score": f"{rates.score:.6g}"})
     results.atomic_write_text(path, text.getvalue())

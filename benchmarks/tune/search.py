@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from benchmarks.display import Display
 from benchmarks.executors import Failure, run_jobs
-from benchmarks.jobs import Job, demonstrations_folder, recording_jobs, tidy
+from benchmarks.jobs import Job, demonstrations_folder, recording_jobs, tidy, wanted, with_events
+from benchmarks.labels import count
 from benchmarks.protocol import Plan, imitates
-from benchmarks.tune import report
+from benchmarks.tune import known, report
 from benchmarks.tune.ranking import Rates, best_clean, finalists, mean, ranked
-from benchmarks.tune.studies import Study, condition, drawn_trials
+from benchmarks.tune.studies import Study, condition, drawn_trials, judge
 from rise_agents import demonstrations
 from rise_agents.files import sweep
 from rise_envs import STAND_INS
@@ -78,12 +80,16 @@ class How:
         every: seconds between two checkpoints of a training.
         command: how it was started, for the comments of settings files.
         write: a settings file that the chosen settings go into, beside the one in the folder.
+        tensorboard: folder for event files of the trainings; None: none are written.
+        known: lines of an earlier search's table, by the name of their result.
     """
 
     workers: int
     every: float
     command: tuple[str, ...]
     write: Path | None = None
+    tensorboard: Path | None = None
+    known: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
 
 
 def given_sets(search: Search) -> dict[str, tuple[Path, str]]:
@@ -128,6 +134,9 @@ def execute(search: Search, sets: Mapping[str, tuple[Path, str]], out: Path, how
         for agent, env in search.pairs()
         if env in sources or not imitates(agent)
     ]
+    if how.known:
+        taken = known.recall(studies, search.plan.seeds, how.known, out)
+        print(f"taken from an earlier search: {count([taken], 'result')}", file=sys.stderr)
     first = {study: range(len(study.trials)) for study in studies}
     failures += _run(_jobs(first, [0], out, how.every), how, "first round: train, judge")
     rates = {study: _measured(study, first[study], [0], out) for study in studies}
@@ -184,7 +193,7 @@ def _recorded(
 
 
 def _jobs(trials: Mapping[Study, Iterable[int]], seeds: Iterable[int], out: Path, every: float) -> list[Job]:
-    """Train and judge; settings that two trials share are trained once."""
+    """Train and judge; settings that two trials share are trained once, and none whose rates are there already."""
     jobs = [
         job
         for seed in seeds
@@ -192,13 +201,14 @@ def _jobs(trials: Mapping[Study, Iterable[int]], seeds: Iterable[int], out: Path
         for trial in numbers
         for job in study.jobs(trial, seed, out, every)
     ]
-    return list({job.output: job for job in jobs}.values())
+    unique = list({job.output: job for job in jobs}.values())
+    return wanted(unique, [job for job in unique if job.run is judge])
 
 
 def _run(jobs: Sequence[Job], how: How, kinds: str) -> list[Failure]:
     with Display() as display:
         display.plan(jobs, kinds)
-        return run_jobs(jobs, how.workers, display.watch, display.say)
+        return run_jobs(with_events(jobs, how.tensorboard), how.workers, display.watch, display.say)
 
 
 def _measured(study: Study, trials: Iterable[int], seeds: Iterable[int], out: Path) -> dict[int, Rates]:

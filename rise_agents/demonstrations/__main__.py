@@ -39,6 +39,7 @@ command again.
 def parser() -> Parser:
     """The command line."""
     p = Parser(
+        plugins=True,
         prog="python -m rise_agents.demonstrations",
         description="Record an expert's safe and successful episodes.",
         epilog=_EXAMPLES,

@@ -5,11 +5,11 @@ A new expert is one file and one line in :data:`EXPERTS`. Its class is made as `
 
 from __future__ import annotations
 
-import importlib
 from typing import Any
 
 from rise_agents.agent import nearest
-from rise_envs import STAND_INS
+from rise_envs import ENVS, STAND_INS
+from rise_envs.registry import Entry, check_new, checked_entry, checked_name, find_class
 from rise_envs.streams import checked_seed
 from rise_envs.task import task_of
 
@@ -22,6 +22,27 @@ EXPERTS: dict[tuple[str, str], str] = {
     ("RISE-SafePanda-v0", "mixture"): "rise_agents.experts.mixture:Mixture",
 }
 """(environment id, expert's name) → ``module:Class``. An environment's stand-in has the same experts."""
+
+
+def register_expert(env_id: str, name: str, entry: Entry) -> None:
+    """Add an expert for an environment to :data:`EXPERTS`.
+
+    Args:
+        env_id: a registered environment with a task description.
+        name: of the expert there.
+        entry: its class (or ``"module:Class"``), made as ``Class(task, seed=0)``, which has a ``predict``.
+
+    Raises:
+        ValueError: a name that is malformed or taken, an environment that is not registered, or a class without
+            ``predict``.
+    """
+    kind = f"expert {checked_name('an expert', name)!r} for {env_id}"
+    if env_id not in ENVS or env_id in STAND_INS:
+        known = [env for env in ENVS if env not in STAND_INS]
+        raise ValueError(f"{kind}: no such environment, or a stand-in for one; {nearest(env_id, known)}")
+    text = checked_entry(kind, entry, ("predict",))[1]
+    check_new(kind, EXPERTS.get((env_id, name)), text)
+    EXPERTS[env_id, name] = text
 
 
 def expert_names(env_id: str) -> tuple[str, ...]:
@@ -52,8 +73,7 @@ def make_expert(name: str, env_id: str, seed: int = 0, **kwargs: Any) -> Any:
     names = expert_names(env_id)
     if name not in names:
         raise ValueError(f"no expert {name!r} for {env_id}; {nearest(name, names)}")
-    module, _, cls = EXPERTS[STAND_INS.get(env_id, env_id), name].partition(":")
-    kind = getattr(importlib.import_module(module), cls)
+    kind = find_class(EXPERTS[STAND_INS.get(env_id, env_id), name])
     # A mixture lists the experts that it draws from.
     experts = [make_expert(member, env_id, seed, **kwargs) for member in getattr(kind, "names", ())]
     given = {"experts": experts} if experts else {}

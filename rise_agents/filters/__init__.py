@@ -6,14 +6,30 @@ has the ``predict`` and the ``initial_state`` of a policy, and says in ``label``
 
 from __future__ import annotations
 
-import importlib
 from typing import Any
 
 from rise_agents.agent import nearest
+from rise_envs.registry import Entry, check_new, checked_entry, checked_name, find_class
 from rise_envs.task import task_of
 
 # name -> "module:Class".
 FILTERS: dict[str, str] = {"kalman": "rise_agents.filters.kalman:KalmanFilter"}
+
+
+def register_filter(name: str, entry: Entry) -> None:
+    """Add a filter to :data:`FILTERS`: rows such as ``pcbc+NAME`` then have it.
+
+    Args:
+        name: of the filter; ``true`` stands for true readings.
+        entry: its class (or ``"module:Class"``), as the top of this module says.
+
+    Raises:
+        ValueError: a name that is malformed or taken, or a class that lacks something.
+    """
+    kind = f"filter {checked_name('a filter', name, ('true',))!r}"
+    text = checked_entry(kind, entry, ("predict", "initial_state", "label"))[1]
+    check_new(kind, FILTERS.get(name), text)
+    FILTERS[name] = text
 
 
 def filter_class(name: str) -> Any:
@@ -24,8 +40,7 @@ def filter_class(name: str) -> Any:
     """
     if name not in FILTERS:
         raise ValueError(f"unknown filter {name!r}: {nearest(name, FILTERS)}")
-    module, _, kind = FILTERS[name].partition(":")
-    return getattr(importlib.import_module(module), kind)
+    return find_class(FILTERS[name])
 
 
 def make_filter(name: str, policy: Any, env_id: str, noise_level: float) -> Any:

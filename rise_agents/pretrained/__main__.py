@@ -31,6 +31,7 @@ examples:
 def parser() -> Parser:
     """The command line."""
     p = Parser(
+        plugins=True,
         prog="python -m rise_agents.pretrained",
         description="Copy the trained agents of a benchmark run to where load_agent finds them by name.",
         epilog=_EXAMPLES,

@@ -1,0 +1,152 @@
+"""The one door to all commands, and what the TAB key completes."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from benchmarks import cli
+from rise_envs import ENVS
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def test_the_console_script_is_this_one():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert project["scripts"] == {"rise-bench": "benchmarks.cli:main"}
+
+
+def test_all_command_lines_of_the_packages_are_there():
+    """Whatever has a parser of its own and can be started."""
+    modules = {
+        ".".join(path.relative_to(ROOT).with_suffix("").parts)
+        for package in ("benchmarks", "rise_agents", "rise_envs")
+        for path in (ROOT / package).rglob("*.py")
+        if "\ndef parser(" in path.read_text() and "\ndef main(" in path.read_text()
+    }
+    assert {command.module for command in cli.COMMANDS.values()} == modules
+
+
+@pytest.mark.parametrize("name", cli.COMMANDS)
+def test_commands_are_handed_what_follows(name, monkeypatch):
+    heard = []
+    module = importlib.import_module(cli.COMMANDS[name].module)
+    monkeypatch.setattr(module, "main", lambda argv: heard.append(argv) or 7)
+    assert cli.main([name, "--agents", "rise", "-h"]) == 7
+    assert heard == [["--agents", "rise", "-h"]]
+
+
+def test_help_lists_all_commands(capsys):
+    assert cli.main(["--help"]) == 0
+    text = capsys.readouterr().out
+    for name, command in cli.COMMANDS.items():
+        assert f"  {name} " in text and command.line in text
+    assert "examples:" in text
+    assert max(map(len, text.splitlines())) <= 120
+    assert cli.main([]) == 2
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["rum"], "unknown command 'rum': did you mean 'run'?"),
+        (["--print-completion"], "takes the name of a shell"),
+        (["--print-completion", "bsh"], "did you mean 'bash'?"),
+        (["run", "--presett", "smoke"], "did you mean '--preset'"),
+    ],
+)
+def test_mistakes_are_one_line(argv, message, capsys):
+    assert cli.main(argv) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+
+
+def test_an_interruption_is_told_by_the_exit_code(monkeypatch):
+    def interrupted(argv):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(importlib.import_module("benchmarks.report"), "main", interrupted)
+    assert cli.main(["report", "x"]) == 130
+
+
+def test_without_the_package_that_writes_scripts(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "shtab", None)
+    assert cli.main(["--print-completion", "bash"]) == 2
+    assert "pip install 'rise-suite[completion]'" in capsys.readouterr().err
+
+
+COMPLETE = """
+source "$1"
+shift
+COMP_WORDS=("$@")
+COMP_CWORD=$(($# - 1))
+compopt() { :; }
+_shtab_rise_bench
+printf '%s\\n' "${COMPREPLY[@]}"
+"""
+
+
+@pytest.fixture(scope="module")
+def script(tmp_path_factory):
+    pytest.importorskip("shtab")
+    code = (
+        "import sys; from benchmarks import cli; status = cli.main(['--print-completion', 'bash']); "
+        "print(*{'torch', 'stable_baselines3', 'pybullet'} & set(sys.modules), file=sys.stderr); sys.exit(status)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert done.stderr.split() == []  # nothing heavy was loaded for it
+    path = tmp_path_factory.mktemp("completion") / "rise-bench"
+    path.write_text(done.stdout)
+    return path
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash")
+@pytest.mark.parametrize(
+    ("words", "offered"),
+    [
+        (["r"], {"run", "report"}),
+        (["run", "--envs", "RISE-G"], {"RISE-GroundVehicle-v0"}),
+        (["run", "--envs", "RISE-GroundVehicle-v0", "RISE-Safe"], {e for e in ENVS if "Safe" in e}),
+        (["run", "--agents", "cpp"], {"cppo", "cppo-long"}),
+        (["run", "--agents", "rise", "--preset", "sm"], {"smoke"}),
+        (["tune", "--eval-env", ""], {"RISE-SafePandaKinematic-v0"}),
+        (["demonstrations", "--min"], {"--minari"}),
+        (["run", "--filter", "k"], {"kalman"}),
+    ],
+)
+def test_bash_offers(script, words, offered):
+    command = ["bash", "-c", COMPLETE, "bash", str(script), "rise-bench", *words]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert set(done.stdout.split()) == offered
+
+
+def test_zsh_and_tcsh_get_theirs():
+    pytest.importorskip("shtab")
+    for shell in ("zsh", "tcsh"):
+        text = cli.completion(shell)
+        assert "rise-bench" in text and "RISE-GroundVehicle-v0" in text
+
+
+def test_a_command_of_the_door_can_be_repeated_from_its_record(tmp_path):
+    """What run.json says is the command of the module, whichever door it came through."""
+    out = tmp_path / "run"
+    argv = [
+        "run",
+        "--agents",
+        "random",
+        "--envs",
+        "RISE-GroundVehicle-v0",
+        "--preset",
+        "smoke",
+        "--no-videos",
+    ]
+    assert cli.main([*argv, "--workers", "1", "--out", str(out)]) == 0
+    command = json.loads((out / "run.json").read_text())["command"]
+    assert command.startswith("python -m benchmarks.run --agents random --envs RISE-GroundVehicle-v0")
