@@ -34,6 +34,8 @@ COMMANDS = {
     "pretrained": Command("rise_agents.pretrained.__main__", "ship the trained agents of a run by name"),
     "export": Command("rise_agents.export.__main__", "make one ONNX file of a trained agent"),
     "runtime": Command("rise_agents.runtime.__main__", "run an agent at a fixed rate, in real time"),
+    "runtime-send": Command("rise_agents.runtime.send", "stream readings and goals to it over UDP"),
+    "runtime-replay": Command("rise_agents.runtime.replay", "show what its log says"),
     "speed": Command("benchmarks.speed.__main__", "measure speed against the peers"),
     "fidelity": Command("benchmarks.fidelity.__main__", "measure the kinematic arm against Bullet's"),
     "faults": Command("benchmarks.faults.__main__", "try to break the suite"),

@@ -111,7 +111,7 @@ def script(tmp_path_factory):
 @pytest.mark.parametrize(
     ("words", "offered"),
     [
-        (["r"], {"run", "report"}),
+        (["ru"], {"run", "runtime", "runtime-send", "runtime-replay"}),
         (["run", "--envs", "RISE-G"], {"RISE-GroundVehicle-v0"}),
         (["run", "--envs", "RISE-GroundVehicle-v0", "RISE-Safe"], {e for e in ENVS if "Safe" in e}),
         (["run", "--agents", "cpp"], {"cppo", "cppo-long"}),
