@@ -12,6 +12,8 @@ from typing import Any
 from benchmarks import report, results
 from benchmarks.display import Display
 from benchmarks.executors import Failure, run_jobs
+from benchmarks.explorer import trajectory_jobs
+from benchmarks.html_report import write_page
 from benchmarks.jobs import (
     Job,
     checkpoint_path,
@@ -37,7 +39,7 @@ class How:
     Attributes:
         workers: processes.
         device: torch device for training.
-        videos: whether to draw clips.
+        videos: whether to draw clips, and to trace the episodes that the report shows step by step.
         every: seconds between two checkpoints of a training.
         command: how this run was started, for ``run.json``.
     """
@@ -62,11 +64,12 @@ def execute(plan: Plan, out: Path, how: How) -> list[Failure]:
     with Display() as display:
         evaluations = evaluation_jobs(plan, out)
         jobs = [*recording_jobs(plan, out), *training_jobs(plan, out, how.device, how.every), *evaluations]
-        jobs += video_jobs(plan, out) if how.videos else []
+        traces = trajectory_jobs(plan, out)
+        jobs += [*video_jobs(plan, out), *traces] if how.videos else []
         display.plan(jobs)
         failures = run_jobs(jobs, how.workers, display.watch, display.say)
     _write_failures(out / "failures.log", failures)
-    _write_run(plan, out, how, failures)
+    _write_run(plan, out, how, failures, [job.output for job in traces if job.output.exists()])
     _write_results(out, evaluations)
     return failures
 
@@ -78,7 +81,9 @@ def _write_results(out: Path, evaluations: list[Job]) -> None:
         return
     rows = results.merge(parts, out / report.EPISODES)
     run = report.read_run(out)
-    asked, *others = sections(report.publish(rows, run, out), run.get("blocks", ()))
+    summary = report.publish(rows, run, out)
+    write_page(summary, run, out, out)
+    asked, *others = sections(summary, run.get("blocks", ()))
     for env in dict.fromkeys(row.env for row in asked.rows):
         print(report.summary_table_text(asked.rows, env))
     if others:
@@ -127,7 +132,7 @@ def _trained_rows(plan: Plan, env: str) -> list[str]:
     return [base for base in bases if plan.agent_of(base)]
 
 
-def _write_run(plan: Plan, out: Path, how: How, failures: list[Failure]) -> None:
+def _write_run(plan: Plan, out: Path, how: How, failures: list[Failure], traces: list[Path]) -> None:
     """``run.json``: all that is needed to repeat the run."""
     cards = {}
     for env in plan.envs:
@@ -162,6 +167,7 @@ def _write_run(plan: Plan, out: Path, how: How, failures: list[Failure]) -> None
         "rows": list(dict.fromkeys(row for env in plan.envs for row, _ in plan.rows(env))),
         "blocks": plan.described(),
         "training": _trained(plan, out),
+        "trajectories": [str(path.relative_to(out)) for path in traces],
         "versions": checkpoint.versions(),
         "python": platform.python_version(),
         "platform": platform.platform(),
