@@ -80,11 +80,6 @@ def write_page(summary: Sequence[SummaryRow], run: Mapping[str, Any], folder: Pa
     trainings = _trainings(asked.rows, run, folder)
     drawn = [pair for group in groups for pair in group.charts] + trainings
     data = {"tasks": packed.tasks, "charts": dict(drawn)}
-    reason = (
-        "the run was started with --no-videos."
-        if folder.joinpath(report.RECORD).exists()
-        else "there are tables alone."
-    )
     text = _template().render(
         title="Safety and reach under noisy obstacle readings",
         version=__version__,
@@ -94,7 +89,6 @@ def write_page(summary: Sequence[SummaryRow], run: Mapping[str, Any], folder: Pa
         pictures=_pictures(out),
         explorer=bool(packed.tasks),
         selection=_selection(packed.tasks),
-        reason=reason,
         run_folder=_command_path(folder),
         meaning=_html(report.meaning(summary)),
         sections=[

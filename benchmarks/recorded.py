@@ -109,11 +109,12 @@ class Run:
         """The checkpoint that ``run.json`` names."""
         name, shipped, digest = entry.partition(_SHIPPED)
         path = pretrained.FOLDER / Path(name).name if shipped else self.folder / name
+        if not path.is_file() and shipped:
+            raise ValueError(f"{path} is missing: this package lacks the weights that the run evaluated")
         if not path.is_file():
-            where = "the package" if shipped else "the run folder, where the agents are"
             raise ValueError(
-                f"{path} is missing: an episode of a trained agent can be re-created only in {where}, not from "
-                "tables alone; of what is published, only episodes of experts and of chance can"
+                f"{path} is missing: an episode of a trained agent can be re-created only in the run folder, where the "
+                "agents are; of what is published, only episodes of experts and of chance can"
             )
         if shipped and pretrained.sha256(path) != digest:
             raise ValueError(

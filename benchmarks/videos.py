@@ -24,7 +24,7 @@ Frame = NDArray[np.uint8]
 FRAMES_PER_SECOND = 10
 HOLD = 12  # frames that the last picture of an episode stays
 KEY_FRAMES = 4
-_BAR = 40  # px, height of the caption
+_BAR, _GAP = 40, 10  # px, height of the caption, and between key frames
 _COLOURS = {"reached": "#1a7f37", "collision": "#c1121f", "not reached": "#9a6700"}
 
 
@@ -90,7 +90,8 @@ def strip(clip: Clip, count: int = KEY_FRAMES) -> Frame:
         cell = Image.fromarray(
             caption(clip.frames[pick], f"t = {clip.times[pick]:.2f} s", words, _COLOURS[clip.outcome])
         )
-        cells.append(np.asarray(cell.resize((cell.width // 2, cell.height // 2), Image.Resampling.LANCZOS)))
+        half = np.asarray(cell.resize((cell.width // 2, cell.height // 2), Image.Resampling.LANCZOS))
+        cells.append(np.pad(half, ((0, 0), (0, _GAP), (0, 0)), constant_values=255))
     return np.concatenate(cells, axis=1)
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
+import shutil
 import subprocess
 import sys
 
@@ -18,6 +21,7 @@ from benchmarks.replay import main
 from benchmarks.run import main as run_benchmark
 from benchmarks.trajectories import OUTCOMES, trace
 from benchmarks.videos import Clip, strip
+from rise_agents import pretrained
 
 VEHICLE, PANDA = "RISE-GroundVehicle-v0", "RISE-SafePanda-v0"
 ROWS = [
@@ -189,6 +193,29 @@ def test_an_environment_that_draws_no_pictures_says_so():
     row = {"env": kinematic, "agent": "random", "scenario": 0, "env_seed": 2**31, "noise_model": "step"}
     with pytest.raises(ValueError, match="draws no pictures"):
         draw(row | {"noise_level": 0.0}, found, [])
+
+
+def test_weights_of_the_package_must_be_those_that_were_evaluated(vehicle, tmp_path, monkeypatch):
+    monkeypatch.setattr(pretrained, "FOLDER", tmp_path)
+    run, entry = open_run(vehicle), "rise.rise of rise_agents.pretrained, SHA-256 "
+    with pytest.raises(ValueError, match="is missing: this package lacks the weights"):
+        run._weights(entry + "0" * 64)
+    (tmp_path / "rise.rise").write_bytes(b"weights")
+    assert run._weights(entry + hashlib.sha256(b"weights").hexdigest()) == tmp_path / "rise.rise"
+    with pytest.raises(ValueError, match="other weights than those that the run evaluated"):
+        run._weights(entry + "0" * 64)
+
+
+def test_a_damaged_record_ends_in_one_line(vehicle, tmp_path, capsys):
+    shutil.copy(vehicle / "episodes.parquet", tmp_path)
+    record = json.loads((vehicle / "run.json").read_text())
+    for plan in ({"agents": [], "noise_models": ["step"]}, {**record["plan"], "episodes": "many"}):
+        (tmp_path / "run.json").write_text(json.dumps(record | {"plan": plan}))
+        assert main([str(tmp_path), "--list"]) == 2
+        assert "run.json is not the record of a run" in capsys.readouterr().err
+    (tmp_path / "run.json").write_text(json.dumps(record | {"settings": {}}))
+    assert main([str(tmp_path), "--agent", "rise", "--scenario", "0"]) == 2
+    assert "does not say how rise acted" in capsys.readouterr().err
 
 
 def test_rows_of_results_are_columns():
