@@ -71,7 +71,7 @@ class Display:
         else:
             self.say(f"{name}: there already")
 
-    def plan(self, jobs: Sequence[Job], kinds: str = "record, train, evaluate, draw") -> None:
+    def plan(self, jobs: Sequence[Job], kinds: str = "record, train, evaluate, draw, trace") -> None:
         """Say how many jobs there will be, and of which ``kinds``."""
         self._jobs = len(jobs)
         there = sum(job.output.exists() for job in jobs)

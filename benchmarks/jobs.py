@@ -18,6 +18,7 @@ from benchmarks import results
 from benchmarks.labels import TRUE, agent_label, split_row
 from benchmarks.policies import make_policy
 from benchmarks.protocol import Plan, Scenarios, digest, imitates
+from benchmarks.trajectories import draws
 from benchmarks.videos import record
 from rise_agents import __version__, agent_class, checkpoint, demonstrations, figures, make_agent, pretrained
 from rise_agents.agent import Progress, acting_settings, config_to_dict, make_config
@@ -26,7 +27,7 @@ from rise_agents.resume import Resume
 from rise_agents.rollout import rollout
 from rise_envs.task import describes_task, env_class
 
-_Actor = tuple[list[Any], dict[str, Any]]  # see _actor
+_Actor = tuple[list[Any], dict[str, Any]]  # see actor_of
 PARTS = "parts"  # folder for the pieces of demonstrations that are being recorded
 
 
@@ -212,13 +213,19 @@ def evaluation_jobs(plan: Plan, out: Path) -> list[Job]:
     jobs = []
     for env in plan.envs:
         for row, seed in plan.rows(env):
-            actor, met = _actor(plan, env, row, seed, out), plan.conditions(env, row, seed)
+            actor, met = actor_of(plan, env, row, seed, out), plan.conditions(env, row, seed)
             for part in plan.chunks(env):
                 first, *others = (_evaluation(plan, out, actor, seed, *condition, part) for condition in met)
                 if split_row(row)[1] == TRUE:  # the same episodes under every condition: run once
                     others = [_repetition(job, first) for job in others]
                 jobs += [first, *others]
     return jobs
+
+
+def evaluated(plan: Plan, out: Path, env: str, row: str, model: str, level: float) -> list[Path]:
+    """Where the episodes of a row under one condition lie, of the first training seed."""
+    actor = actor_of(plan, env, row, 0, out)
+    return [_evaluation(plan, out, actor, 0, model, level, part).output for part in plan.chunks(env)]
 
 
 def _evaluation(
@@ -241,7 +248,7 @@ def _repetition(job: Job, first: Job) -> Job:
     return replace(job, run=repeat, arguments=arguments, needs=(first.output,), weight=0.1)
 
 
-def _actor(plan: Plan, env: str, row: str, seed: int, out: Path) -> _Actor:
+def actor_of(plan: Plan, env: str, row: str, seed: int, out: Path) -> _Actor:
     """What names the policy of a row in a digest, and the arguments of a job that needs it."""
     trained = checkpoint_path(plan, env, row, seed, out) if plan.agent_of(row) else None
     settings = how_it_acts(plan, env, row)
@@ -257,13 +264,13 @@ def video_jobs(plan: Plan, out: Path) -> list[Job]:
     """One clip for each row that was asked for, of its first training seed, at the headline noise level."""
     headline, model = min(plan.noise_levels, key=lambda x: (abs(x - 1), x)), plan.noise_models[0]
     jobs = []
-    for env in plan.envs:
+    for env in filter(draws, plan.envs):
         asked = plan.described()[0]["rows"]
         for row, seed in plan.rows(env):
             if seed or row not in asked or "rgb_array" not in env_class(env).metadata["render_modes"]:
                 continue
             level = 0.0 if split_row(row)[1] == TRUE else headline
-            source, arguments = _actor(plan, env, row, 0, out)
+            source, arguments = actor_of(plan, env, row, 0, out)
             seeds = [int(s) for s in Scenarios(0, min(plan.clips, plan.episodes)).seeds()]
             arguments |= {"seeds": seeds, "noise_model": model, "noise_level": level}
             arguments["label"] = agent_label(row)

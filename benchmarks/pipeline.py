@@ -13,6 +13,8 @@ from typing import Any
 from benchmarks import published, report, results
 from benchmarks.display import Display
 from benchmarks.executors import Failure, never, run_jobs
+from benchmarks.explorer import trajectory_jobs
+from benchmarks.html_report import write_page
 from benchmarks.jobs import (
     Job,
     checkpoint_name,
@@ -43,7 +45,7 @@ class How:
     Attributes:
         workers: processes.
         device: torch device for training.
-        videos: whether to draw clips.
+        videos: whether to draw clips, and to trace the episodes that the report shows step by step.
         every: seconds between two checkpoints of a training.
         command: how this run was started, for ``run.json``.
         tensorboard: folder for event files of the trainings; None: none are written.
@@ -91,7 +93,8 @@ def execute(plan: Plan, out: Path, how: How) -> Outcome:
         found = published.matches(how.source, plan, out, evaluations) if how.source else []
         if how.source:
             display.say(published.take(how.source, found))
-        ends = [*evaluations, *(video_jobs(plan, out) if how.videos else [])]
+        traces = trajectory_jobs(plan, out)
+        ends = [*evaluations, *([*video_jobs(plan, out), *traces] if how.videos else [])]
         before = [*recording_jobs(plan, out), *training_jobs(plan, out, how.device, how.every)]
         jobs = wanted([*before, *ends], ends)
         display.plan(jobs)
@@ -102,7 +105,7 @@ def execute(plan: Plan, out: Path, how: How) -> Outcome:
     # Asked again: pieces of a set of demonstrations are gone, and not needed, as soon as it is put together.
     outcome = Outcome(failures, [job for job in wanted(jobs, ends) if not job.output.exists()])
     _write_failures(out / "failures.log", failures)
-    _write_run(plan, out, how, outcome, how.source if found else None)
+    _write_run(plan, out, how, outcome, how.source if found else None, traces)
     _write_results(out, evaluations)
     return outcome
 
@@ -115,7 +118,9 @@ def _write_results(out: Path, evaluations: list[Job]) -> None:
         return
     rows = results.merge(parts, out / report.EPISODES)
     run = report.read_run(out)
-    asked, *others = sections(report.publish(rows, run, out), run.get("blocks", ()))
+    summary = report.publish(rows, run, out)
+    write_page(summary, run, out, out)
+    asked, *others = sections(summary, run.get("blocks", ()))
     for env in dict.fromkeys(row.env for row in asked.rows):
         print(report.summary_table_text(asked.rows, env))
     if others:
@@ -174,7 +179,9 @@ def _cards(plan: Plan, out: Path, source: Published | None) -> dict[str, Any]:
     return cards
 
 
-def _write_run(plan: Plan, out: Path, how: How, outcome: Outcome, source: Published | None) -> None:
+def _write_run(
+    plan: Plan, out: Path, how: How, outcome: Outcome, source: Published | None, traces: list[Job]
+) -> None:
     """``run.json``: all that is needed to repeat the run; ``source``: published results that are a part of it."""
     run = {
         "command": shlex.join(how.command),
@@ -203,6 +210,7 @@ def _write_run(plan: Plan, out: Path, how: How, outcome: Outcome, source: Publis
         "blocks": plan.described(),
         "training": _trained(plan, out),
         "taken_from": source.origin() if source else [],
+        "trajectories": [str(job.output.relative_to(out)) for job in traces if job.output.exists()],
         "versions": checkpoint.versions(),
         "python": platform.python_version(),
         "platform": platform.platform(),

@@ -216,7 +216,12 @@ def colour(agents: Sequence[str], agent: str) -> str:
     if agent in _COLOURS:
         return _COLOURS[agent]
     others = [name for name in agents if name not in _COLOURS]
-    return _SPARE_COLOURS[others.index(agent) % len(_SPARE_COLOURS)]
+    return spare_colour(others.index(agent))
+
+
+def spare_colour(place: int) -> str:
+    """A colour for what has none of its own: the one at ``place``."""
+    return _SPARE_COLOURS[place % len(_SPARE_COLOURS)]
 
 
 def _intervals(rows: Sequence[SummaryRow]) -> str:

@@ -225,9 +225,14 @@ class Plan:
         return described
 
     def chunks(self, env: str) -> list[Scenarios]:
-        """The scenarios in the portions that jobs take: fixed, so that workers do not change results."""
-        size = 1_000 if is_batched_env(env) else 100
-        return [Scenarios(at, min(size, self.episodes - at)) for at in range(0, self.episodes, size)]
+        """The scenarios in the portions that jobs take."""
+        return portions(env, self.episodes)
+
+
+def portions(env: str, episodes: int) -> list[Scenarios]:
+    """``episodes`` scenarios in portions that run side by side: fixed, so that workers do not change results."""
+    size = 1_000 if is_batched_env(env) else 100
+    return [Scenarios(at, min(size, episodes - at)) for at in range(0, episodes, size)]
 
 
 def check_names(agents: Iterable[str], settings: Iterable[str], variants: Mapping[str, Variant]) -> None:

@@ -15,7 +15,11 @@ from rise_agents.cli import Parser, prepare_folder
 from rise_agents.files import sole_user
 
 DEFAULT_OUT = Path("docs") / "results"
-_OF_THE_MACHINE = ("platform", "failed")  # entries of run.json that say nothing of the results
+_OF_THE_MACHINE = (
+    "platform",
+    "failed",
+    "trajectories",
+)  # entries of run.json that say nothing of the results
 _FOLDERS = re.compile(r"(?<![\w.:~-])/(?:[^\s/'\"]+/)+")  # those of an absolute path, not its last name
 _EXAMPLES = f"""\
 examples:

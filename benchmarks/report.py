@@ -115,17 +115,13 @@ def summary_markdown(summary: Sequence[SummaryRow], run: Mapping[str, Any]) -> s
     blocks = ["# Results", *what_is_left(run), *claims(asked.rows)]
     for path, caption in run.get("figures", FIGURES).items():
         blocks.append(f"{'!' if path.endswith('.png') else ''}[{caption}]({path})")
-    blocks += ["## Tables", _MEANING + (_SEVERAL_SEEDS if several_seeds(summary) else _ONE_SEED)]
+    blocks += ["## Tables", meaning(summary)]
     for section in (asked, *others):
         blocks += [f"## {section.title}"] * bool(section.title)
-        for env in dict.fromkeys(row.env for row in section.rows):
-            rows = _rows_of(section.rows, env)
-            blocks += [f"### {_title(rows)}", _markdown_table(rows)]
-    lines = [
-        line for name, facts in run.get("training", {}).items() for line in _fact(agent_label(name), facts)
-    ]
-    if lines:
-        blocks += ["## How the agents were trained", "\n".join(lines)]
+        blocks += tables_markdown(section.rows)
+    trained = training_markdown(run)
+    if trained:
+        blocks += ["## How the agents were trained", trained]
     if "command" in run:
         blocks += ["## How to repeat", f"```sh\n{run['command']}\n```"]
     return "\n\n".join(blocks) + "\n"
@@ -138,6 +134,26 @@ def what_is_left(run: Mapping[str, Any]) -> list[str]:
         return []
     pieces = f"{count([left], 'piece')} of work {'is' if left == 1 else 'are'} left"
     return [f"**Not finished:** {pieces}, so rows can be missing, or have fewer episodes than others."]
+
+
+def meaning(summary: Sequence[SummaryRow]) -> str:
+    """What the columns of the tables say, and their intervals, in a paragraph of Markdown."""
+    return _MEANING + (_SEVERAL_SEEDS if several_seeds(summary) else _ONE_SEED)
+
+
+def tables_markdown(summary: Sequence[SummaryRow]) -> list[str]:
+    """A heading and a table per task, in Markdown."""
+    blocks = []
+    for env in dict.fromkeys(row.env for row in summary):
+        rows = _rows_of(summary, env)
+        blocks += [f"### {_title(rows)}", _markdown_table(rows)]
+    return blocks
+
+
+def training_markdown(run: Mapping[str, Any]) -> str:
+    """How the agents of a run were trained, as a list in Markdown; empty where nothing is known."""
+    known = run.get("training", {}).items()
+    return "\n".join(line for name, facts in known for line in _fact(agent_label(name), facts))
 
 
 def claims(summary: Sequence[SummaryRow]) -> list[str]:
@@ -351,6 +367,9 @@ def read_run(folder: Path) -> dict[str, Any]:
             "labels": {name: str(each["label"]) for name, each in variants if each["label"]},
             "unfinished": int(record.get("unfinished", 0)),
             "blocks": [_block(each) for each in record.get("blocks", ())],
+            "agents": {env: dict(paths) for env, paths in dict(record.get("agents", {})).items()},
+            "trajectories": [str(name) for name in record.get("trajectories", ())],
+            "versions": dict(record.get("versions", {})),
         }
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(f"{path} is not the record of a run ({type(error).__name__}: {error})") from None
@@ -393,6 +412,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         prepare_folder(out)
         with sole_user(out) if (out / RECORD).exists() else nullcontext():  # a run may be at work there
             summary = publish(rows, run, out)
+            from benchmarks.html_report import write_page  # it stands on this file
+
+            write_page(summary, run, episodes.parent, out)
     except (ValueError, OSError) as error:
         print(f"benchmarks.report: {error}", file=sys.stderr)
         return 2 if isinstance(error, ValueError) else 1

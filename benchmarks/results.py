@@ -144,12 +144,17 @@ def _write(path: StrPath, table: pa.Table, options: Mapping[str, Any]) -> None:
 def rounded(table: pa.Table) -> pa.Table:
     """Rows whose clearance and return are multiples of 2⁻¹³, about 10⁻⁴; a negative clearance stays negative."""
     for name in _ROUNDED:
-        values = table[name].to_numpy()
-        nearest = np.round(values / _GRID) * _GRID + 0.0  # + 0: never "-0"
-        if name == "min_clearance":
-            nearest = np.where(values < 0, np.minimum(nearest, -_GRID), nearest)
+        nearest = rounded_values(name, table[name].to_numpy())
         table = table.set_column(table.column_names.index(name), SCHEMA.field(name), pa.array(nearest))
     return table
+
+
+def rounded_values(name: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Values (T,) of the column ``name`` as :func:`rounded` has them."""
+    if name not in _ROUNDED:
+        return values
+    nearest = np.round(values / _GRID) * _GRID + 0.0  # + 0: never "-0"
+    return np.where(values < 0, np.minimum(nearest, -_GRID), nearest) if name == "min_clearance" else nearest
 
 
 def read_rows(path: StrPath) -> pa.Table:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,17 +15,16 @@ from PIL import Image, ImageDraw, ImageFont
 
 from benchmarks.labels import env_label
 from benchmarks.policies import make_policy
-from rise_agents.agent import Progress, initial_state
+from benchmarks.trajectories import Act, Trajectory, acting, play
+from rise_agents.agent import Progress
 from rise_agents.files import replace_file, replacing
-from rise_agents.rollout import policy_keys
-from rise_envs.noise_wrappers import ObservationNoise
-from rise_envs.task import describes_task, task_of
+from rise_envs.task import describes_task, env_class, task_of
 
 Frame = NDArray[np.uint8]
 FRAMES_PER_SECOND = 10
 HOLD = 12  # frames that the last picture of an episode stays
 KEY_FRAMES = 4
-_BAR = 40  # px, height of the caption
+_BAR, _GAP = 40, 10  # px, height of the caption, and between key frames
 _COLOURS = {"reached": "#1a7f37", "collision": "#c1121f", "not reached": "#9a6700"}
 
 
@@ -35,29 +35,27 @@ class Clip:
     frames: list[Frame]
     times: list[float]  # s
     outcome: str
+    closest: int  # the frame after the step with the least clearance
+    clearance: float  # m, least
 
 
-def film(policy: Any, env_id: str, seed: int, noise_model: str, noise_level: float) -> Clip:
-    """Draw the episode that ``seed`` names, with the noise that the benchmark gives it."""
-    env: gym.Env = gym.make(env_id, render_mode="rgb_array")
-    dt = task_of(env_id).dt if describes_task(env_id) else 1.0 / env.metadata.get("render_fps", 10)
-    if noise_level > 0:
-        env = ObservationNoise(env, noise_model, noise_level=noise_level)
-    try:
-        observation, _ = env.reset(seed=seed, options={"noise_seed": seed} if noise_level > 0 else None)
-        state, cost, over, reached = initial_state(policy, policy_keys([seed])), 0.0, False, False
-        frames, start = [_frame(env)], np.ones(1, bool)
-        deterministic = getattr(policy, "evaluate_deterministic", True)
-        while not over:
-            action, state = policy.predict(observation, state, start, deterministic)
-            observation, _, terminated, truncated, info = env.step(action)
-            frames.append(_frame(env))
-            cost, over, start = cost + info["cost"], terminated or truncated, np.zeros(1, bool)
-            reached = info["is_success"]
-    finally:
-        env.close()
-    outcome = "collision" if cost else "reached" if reached else "not reached"
-    return Clip(frames, [i * dt for i in range(len(frames))], outcome)
+def film(act: Act, env_id: str, seed: int, noise_model: str, noise_level: float) -> Clip:
+    """Draw the episode that ``seed`` names, with the noise that the benchmark gives it.
+
+    Raises:
+        ValueError: an environment that draws no pictures.
+    """
+    frames: list[Frame] = []
+    episode = play(act, env_id, seed, noise_model, noise_level, watch=lambda env: frames.append(_frame(env)))
+    metadata = env_class(env_id).metadata
+    dt = task_of(env_id).dt if describes_task(env_id) else 1.0 / metadata.get("render_fps", 10)
+    times = [i * dt for i in range(len(frames))]
+    return Clip(frames, times, outcome(episode), episode.closest, episode.outcomes["min_clearance"])
+
+
+def outcome(episode: Trajectory) -> str:
+    """How an episode ended, in a word or two."""
+    return "collision" if episode.cost.any() else "reached" if episode.arrived else "not reached"
 
 
 def _frame(env: gym.Env) -> Frame:
@@ -80,17 +78,61 @@ def caption(frame: Frame, left: str, right: str = "", colour: str = "#24292f") -
 
 
 def strip(clip: Clip, count: int = KEY_FRAMES) -> Frame:
-    """``count`` frames of an episode side by side, evenly spread from start to end, at half size."""
+    """``count`` frames of an episode side by side at half size, from start to end, one of them the closest moment."""
     picks = np.linspace(0, len(clip.frames) - 1, count).round().astype(int)
+    if count > 2:
+        inner = 1 + int(np.abs(picks[1:-1] - clip.closest).argmin())
+        picks[inner] = clip.closest
     cells = []
     for n, pick in enumerate(picks):
-        last = n == count - 1
-        words = clip.outcome if last else ""
+        last, words = n == count - 1, ""
+        if pick == clip.closest:
+            words = f"closest: {clip.clearance:.2f} m"
+        words = clip.outcome if last else words
         cell = Image.fromarray(
             caption(clip.frames[pick], f"t = {clip.times[pick]:.2f} s", words, _COLOURS[clip.outcome])
         )
-        cells.append(np.asarray(cell.resize((cell.width // 2, cell.height // 2), Image.Resampling.LANCZOS)))
+        half = np.asarray(cell.resize((cell.width // 2, cell.height // 2), Image.Resampling.LANCZOS))
+        cells.append(np.pad(half, ((0, 0), (0, _GAP), (0, 0)), constant_values=255))
     return np.concatenate(cells, axis=1)
+
+
+def captioned(clip: Clip, title: str, mark: str = "") -> list[Frame]:
+    """The frames of an episode under ``title``, with ``mark`` and time beside it, the last one for longer."""
+    frames: list[Frame] = []
+    for i, frame in enumerate(clip.frames):
+        ended = i == len(clip.frames) - 1
+        words = clip.outcome if ended else f"{mark}{clip.times[i]:.2f} s"
+        done = caption(frame, title, words, _COLOURS[clip.outcome] if ended else "#57606a")
+        frames += [done] * (HOLD if ended else 1)
+    return frames
+
+
+def write_strip(path: Path, clip: Clip) -> None:
+    """Write key frames of an episode as PNG.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    replace_file(path, iio.imwrite("<bytes>", strip(clip), extension=".png"))
+
+
+def write_film(path: Path, frames: Sequence[Frame], per_second: float = FRAMES_PER_SECOND) -> None:
+    """Write frames as MP4.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    with replacing(path) as partial:
+        iio.imwrite(
+            partial,
+            np.stack(frames),
+            extension=".mp4",
+            fps=per_second,
+            codec="libx264",
+            macro_block_size=16,
+            output_params=["-preset", "veryfast"],  # half the time of the usual one, files a tenth larger
+        )
 
 
 def record(
@@ -107,27 +149,12 @@ def record(
 ) -> None:
     """Write an MP4 of the episodes that ``seeds`` name, and a PNG strip of key frames of the first."""
     policy = make_policy(env, row, checkpoint, settings, noise_level)
-    clips = []
-    for n, seed in enumerate(seeds):
-        clips.append(film(policy, env, seed, noise_model, noise_level))
-        progress((n + 0.5) / len(seeds), {})
     title = f"{label} · {env_label(env)} · noise level {noise_level:g}"
     frames: list[Frame] = []
-    for n, clip in enumerate(clips):
-        for i, frame in enumerate(clip.frames):
-            ended = i == len(clip.frames) - 1
-            words = clip.outcome if ended else f"scenario {n} · {clip.times[i]:.2f} s"
-            captioned = caption(frame, title, words, _COLOURS[clip.outcome] if ended else "#57606a")
-            frames += [captioned] * (HOLD if ended else 1)
-    strip_png = iio.imwrite("<bytes>", strip(clips[0]), extension=".png")
-    replace_file(output.with_name(f"{output.stem}-frames.png"), strip_png)
-    with replacing(output) as partial:
-        iio.imwrite(
-            partial,
-            np.stack(frames),
-            extension=".mp4",
-            fps=FRAMES_PER_SECOND,
-            codec="libx264",
-            macro_block_size=16,
-            output_params=["-preset", "veryfast"],  # half the time of the usual one, files a tenth larger
-        )
+    for n, seed in enumerate(seeds):
+        clip = film(acting(policy, seed), env, seed, noise_model, noise_level)
+        frames += captioned(clip, title, f"scenario {n} · ")
+        if not n:
+            write_strip(output.with_name(f"{output.stem}-frames.png"), clip)
+        progress((n + 0.5) / len(seeds), {})
+    write_film(output, frames)

@@ -64,6 +64,11 @@ def is_batched_env(env_id: str) -> bool:
     return gym.spec(env_id).vector_entry_point is not None
 
 
+def side_by_side(env_id: str, episodes: int) -> int:
+    """How many of so many episodes run at a time, unless told: a policy always computes that many rows together."""
+    return min(BATCHED_SLOTS if is_batched_env(env_id) else SINGLE_SLOTS, episodes)
+
+
 def make_slots(env_id: str, slots: int, **kwargs: Any) -> VectorEnv:
     """``slots`` sub-environments whose resets are ours to call."""
     mode: dict[str, Any] = {"autoreset_mode": AutoresetMode.DISABLED}
@@ -107,7 +112,7 @@ def rollout(
     env_seeds = np.asarray(env_seeds, np.int64)
     noise_seeds = env_seeds if noise_seeds is None else np.asarray(noise_seeds, np.int64)
     total = len(env_seeds)
-    slots = min(slots or (BATCHED_SLOTS if is_batched_env(env_id) else SINGLE_SLOTS), total)
+    slots = min(slots, total) if slots else side_by_side(env_id, total)
     keys = policy_keys(noise_seeds)
 
     env = make_slots(env_id, slots, **(env_kwargs or {}))

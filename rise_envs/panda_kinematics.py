@@ -256,3 +256,22 @@ def clearance(q: Array, center: Array, radius: Array) -> tuple[Array, NDArray[np
     least, capsule = np.empty(len(q)), np.empty(len(q), np.int64)
     _clearances(_packed(q), _packed(center), _packed(radius), least, capsule)
     return least, capsule
+
+
+def capsules(q: Array) -> tuple[Array, Array]:
+    """The capsules of arms.
+
+    Args:
+        q: joint angles (rad), (B, 7).
+
+    Returns:
+        Both ends of their axes (m), (B, K, 2, 3), and their radii (m), (K,).
+    """
+    local = np.stack((CAPSULE_START, CAPSULE_START + CAPSULE_EDGE), 1)
+    ends = np.empty((len(q), N_CAPSULES, 2, 3))
+    rotation, position = np.empty((N_FRAMES, 3, 3)), np.empty((N_FRAMES, 3))
+    for b, angles in enumerate(_packed(q)):
+        write_frames(angles, rotation, position)
+        turned = np.einsum("krc,kec->ker", rotation[CAPSULE_FRAME], local)
+        ends[b] = turned + position[CAPSULE_FRAME][:, None]
+    return ends, CAPSULE_RADIUS.copy()

@@ -23,6 +23,7 @@ from rise_envs.rendering import (
     GOAL,
     GOAL_FILL,
     INK,
+    MOTION,
     OBSTACLE,
     OBSTACLE_RIM,
     PALE_INK,
@@ -47,6 +48,9 @@ EYE, TARGET = np.array([0.97, -0.82, 0.90]), np.array([-0.16, -0.02, 0.28])  # m
 FIELD = np.radians(38.0)  # vertical angle of view
 NEAR, FAR = 0.1, 6.0  # m
 LIGHT = np.array([0.45, -0.45, 0.77])
+HAND_ARROW_TIME = (
+    0.2  # s: the hand's arrow shows where it would go in this time; it is much faster than the sphere
+)
 SKY = np.array([[236, 239, 244], [250, 251, 253]])  # the backdrop's colours, top and bottom
 
 
@@ -203,6 +207,8 @@ def draw_panda_scene(
 ) -> Image:
     """The arm's scene: arm and table, trail of the hand, goal, true sphere (solid), sphere as read (translucent).
 
+    Arrows show how the sphere moves, and how the hand has moved in the last step.
+
     Args:
         shot: the engine's picture (VIEW, WIDTH, 3) of arm and table, its depth buffer (VIEW, WIDTH), and where
             it shows either of them (VIEW, WIDTH).
@@ -228,6 +234,8 @@ def draw_panda_scene(
     picture.ball(goal, goal_radius, GOAL, alpha=0.25)
     picture.rim(goal, goal_radius, GOAL, 1.5)
     picture.arrow(center, ARROW_TIME * velocity, OBSTACLE_RIM)
+    if len(trail) > 1:
+        picture.arrow(trail[-1], HAND_ARROW_TIME / dt * (trail[-1] - trail[-2]), MOTION, 3.0)
     if clearance < 0:
         picture.rim(center, radius + 0.006, WARNING, 3.0)
     if perceived is not None:

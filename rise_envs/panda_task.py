@@ -55,6 +55,7 @@ class PandaTask(goals.GoalAPI):
             obstacle_speed=p.max_speed,
             redraw_interval=p.redraw_interval,
             moved=_moved,
+            body=_body,
         )
 
     @property
@@ -71,6 +72,13 @@ class PandaTask(goals.GoalAPI):
 def _pose(state: Array) -> tuple[Array, Array]:
     """The hand's frame: its position, axes parallel to the world's."""
     return state[..., :3], np.broadcast_to(np.eye(3), (*state.shape[:-1], 3, 3))
+
+
+def _body(state: Array) -> tuple[Array, Array]:
+    """The capsules of the arms at the joint angles of the states."""
+    from rise_envs import panda_kinematics  # numba is loaded by those who ask only
+
+    return panda_kinematics.capsules(state[..., 6:13])
 
 
 def _moved(state: Array, action: Array, dt: float) -> Array:

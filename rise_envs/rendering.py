@@ -22,6 +22,7 @@ SIZE, STRIP = 640, 32  # px: the square view and the line of text below it; mult
 SMOOTH = 2
 MARGIN = 1.0  # m around the arena
 ARROW_TIME = 2.0  # s: arrows show where a disc would go in this time
+VEHICLE_ARROW_TIME = 1.0  # s: and the vehicle, which is faster, in this one
 
 Colour = tuple[int, int, int]
 Pixel = tuple[float, float]
@@ -32,6 +33,7 @@ GOAL, GOAL_FILL = (21, 145, 68), (206, 240, 216)
 OBSTACLE, OBSTACLE_RIM = (229, 72, 77), (150, 24, 32)
 READING = (64, 34, 120)
 WARNING = (205, 32, 44)
+MOTION = (240, 150, 10)  # of the robot's arrow: the paper's key frames have such
 
 
 class Canvas:
@@ -112,6 +114,8 @@ def draw_vehicle_scene(
 ) -> NDArray[np.uint8]:
     """The vehicle's scene: arena, start, trail, goal, true discs (solid), discs as read (dashed), vehicle.
 
+    Arrows show how discs move, and how the vehicle has moved in the last step.
+
     The view holds the whole arena, and widens when the vehicle has left it.
 
     Args:
@@ -137,6 +141,8 @@ def draw_vehicle_scene(
         canvas.arrow(disc[:2], ARROW_TIME * disc[2:4], OBSTACLE_RIM)
     clearance = np.linalg.norm(discs[:, :2] - state[:2], axis=-1) - discs[:, 4] - params.robot_radius
     _draw_vehicle(canvas, state, params.robot_radius, bool(clearance.min() < 0))
+    if len(trail) > 1:
+        _draw_motion(canvas, trail[-1], (trail[-1] - trail[-2]) / params.dt, params.robot_radius)
     for disc in () if perceived is None else perceived.reshape(n_obstacles, 5):
         _draw_as_read(canvas, disc)
     _draw_strip(canvas, (len(trail) - 1) * params.dt, float(clearance.min()), perceived is not None)
@@ -188,6 +194,15 @@ def _draw_vehicle(canvas: Canvas, state: Array, radius: float, collides: bool) -
     pygame.draw.polygon(canvas.surface, FLOOR, [canvas.at(p) for p in wedge])
     if collides:
         canvas.ring(position, radius + 6 * SMOOTH / canvas.scale, WARNING, 3.0)
+
+
+def _draw_motion(canvas: Canvas, position: Array, velocity: Array, radius: float) -> None:
+    """Where the vehicle would go, from its rim on: the wedge stays visible."""
+    way = VEHICLE_ARROW_TIME * velocity
+    length = float(np.hypot(*way))
+    if length > radius:
+        rim = radius / length * way
+        canvas.arrow(position + rim, way - rim, MOTION, 3.5)
 
 
 def _draw_as_read(canvas: Canvas, disc: Array) -> None:

@@ -43,6 +43,8 @@ class Task:
         redraw_interval: mean time between two draws of a ball's velocity (s).
         moved: maps states (B, S), K actions for each (B, K, A) and ``dt`` to where the reference point is one step
             later, (B, K, D): the robot's kinematics, for who may use them.
+        body: for a robot that is more than a ball, maps states (B, S) to the K capsules that it consists of: both
+            ends of their axes (m), (B, K, 2, D), and their radii (m), (K,). For who draws it.
     """
 
     dim: int
@@ -58,6 +60,7 @@ class Task:
     obstacle_speed: float
     redraw_interval: float
     moved: Callable[[Array, Array, float], Array]
+    body: Callable[[Array], tuple[Array, Array]] | None = None
 
     @cached_property
     def widths(self) -> dict[str, int]:

@@ -17,6 +17,7 @@ import pytest
 
 from benchmarks.configs import SHIPPED, read
 from benchmarks.presets import PRESETS
+from benchmarks.replay import parser as replay_parser
 from benchmarks.results import SCHEMA
 from benchmarks.run import parser
 from benchmarks.speed.page import BLOCK
@@ -328,10 +329,16 @@ def test_the_table_of_presets_agrees_with_them(preset):
 
 
 @pytest.mark.parametrize(
-    ("head", "command"), [("option", parser()), ("option of the search", tune_parser())], ids=["run", "tune"]
+    ("head", "command"),
+    [
+        ("option", parser()),
+        ("option of the search", tune_parser()),
+        ("option of the replay", replay_parser()),
+    ],
+    ids=["run", "tune", "replay"],
 )
 def test_the_table_of_options_has_every_option_of_the_command(head, command):
-    actions = {action.option_strings[-1]: action for action in command._actions}
+    actions = {action.option_strings[-1]: action for action in command._actions if action.option_strings}
     rows = table("benchmark.md", head, "default")
     assert {row[0] for row in rows} == set(actions) - {"--help"}
     for option, default, _ in rows:

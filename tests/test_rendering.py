@@ -24,9 +24,12 @@ PERCEIVED = np.array([-4.0, -6.0, 0.0, 0.8, 2.0])
 
 
 def scene(
-    state: np.ndarray = STATE, reading: np.ndarray = READING, perceived: np.ndarray | None = None
+    state: np.ndarray = STATE,
+    reading: np.ndarray = READING,
+    perceived: np.ndarray | None = None,
+    step: tuple[float, float] = (0.05, 0.03),
 ) -> np.ndarray:
-    trail = [state[:2] - [0.5, 0.5], state[:2]]
+    trail = [state[:2] - [0.5, 0.5], state[:2] - step, state[:2]]
     return draw_vehicle_scene(state, GOAL, len(reading) // 5, reading, perceived, trail, PARAMS)
 
 
@@ -59,7 +62,7 @@ def test_pictures_are_plain_arrays_of_their_own() -> None:
 
 def test_everything_is_where_and_as_large_as_it_is() -> None:
     still = np.array([3.0, 4.0, 0.0, 0.0, 1.5])  # no arrow over the disc
-    picture = scene(reading=still)
+    picture = scene(reading=still, step=(0.0, 0.0))
     red = picture[:SIZE, :, 0].astype(int) - picture[:SIZE, :, 1] > 60  # half-covered pixels of the rim too
     np.testing.assert_allclose(middle(red), [3, 4], atol=0.03)
     assert red.sum() / SCALE**2 == pytest.approx(np.pi * 1.5**2, rel=0.04)
@@ -68,6 +71,19 @@ def test_everything_is_where_and_as_large_as_it_is() -> None:
     np.testing.assert_allclose(middle(like(picture, rendering.GOAL_FILL)), GOAL, atol=0.1)
     assert tuple(pixel(picture, 12.5, 12.5)) == rendering.OUTSIDE
     assert tuple(pixel(picture, 0.5, 0.5)) == rendering.FLOOR
+
+
+@pytest.mark.parametrize("step", [(0.2, 0.1), (-0.1, 0.15)])
+def test_an_arrow_shows_where_the_vehicle_goes_in_a_second(step: tuple[float, float]) -> None:
+    way = np.array(step) / PARAMS.dt
+    rim = PARAMS.robot_radius * way / np.hypot(*way)
+    orange = like(scene(step=step), rendering.MOTION)
+    rows, columns = np.nonzero(orange)
+    found = np.stack((columns / SCALE - HALF, HALF - rows / SCALE), -1) - STATE[:2]
+    along = found @ way / np.hypot(*way)
+    assert along.max() == pytest.approx(np.hypot(*way), abs=0.12)
+    assert along.min() == pytest.approx(np.hypot(*rim), abs=0.12)
+    assert not like(scene(step=(0.0, 0.0)), rendering.MOTION).any()
 
 
 @pytest.mark.parametrize("heading", [0.0, 2.0, -2.5])

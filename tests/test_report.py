@@ -198,7 +198,7 @@ RECORD = {
     "rows": ["rise", "pcbc"],
     "training": {"rise": {VEHICLE: {"beta": 0.03}}},
 }
-FILES = {"summary.csv", "comparisons.csv", "summary.md", "comparison.png", "noise_curve.png"}
+FILES = {"summary.csv", "comparisons.csv", "summary.md", "comparison.png", "noise_curve.png", "report.html"}
 
 
 def episodes(models=("step",)):

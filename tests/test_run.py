@@ -59,11 +59,16 @@ def test_every_promised_file_is_there(run):
         "comparisons.csv",
         "summary.md",
         "comparison.png",
+        "report.html",
         "noise_curve.png",
         "run.json",
     }
     assert len(list((run / "videos").glob("*.mp4"))) == 3
     assert len(list((run / "videos").glob("*-frames.png"))) == 3
+    traces = [str(path.relative_to(run)) for path in (run / "trajectories").iterdir()]
+    assert sorted(json.loads((run / "run.json").read_text())["trajectories"]) == sorted(traces)
+    assert len(traces) == 3 * 2  # rows, levels
+    assert 'id="player"' in (run / "report.html").read_text()
     assert not list(run.rglob(".partial-*"))
 
 
@@ -131,7 +136,11 @@ def test_clips_are_videos_that_move(run):
 
 def test_again_in_the_same_folder_redoes_nothing(run, capfd):
     tables = {name: (run / name).read_bytes() for name in ("episodes.parquet", "summary.csv", "summary.md")}
-    work = [path for folder in ("agents", "parts", "videos") for path in (run / folder).rglob("*.*")]
+    work = [
+        path
+        for folder in ("agents", "parts", "videos", "trajectories")
+        for path in (run / folder).rglob("*.*")
+    ]
     before = {path: path.stat().st_mtime_ns for path in work}
     assert main([*SMALL, "--workers", "1", "--out", str(run)]) == 0
     assert {path: path.stat().st_mtime_ns for path in work} == before

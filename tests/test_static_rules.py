@@ -37,7 +37,7 @@ ATTRIBUTES = {"recover_environment"}  # of Minari's data sets: makes whatever en
 KEYWORDS = {"allow_pickle": False, "weights_only": True, "trust_remote_code": False, "shell": False}
 # Whose load() reads numbers, texts or our own formats. Any other one is suspect: those of stable-baselines3 unpickle.
 LOADERS = {
-    *{"json", "tomllib", "numpy", "safetensors.numpy"},
+    *{"json", "tomllib", "numpy", "safetensors.numpy", "benchmarks.trajectories"},
     *{"rise_agents.checkpoint", "rise_agents.demonstrations", "rise_agents.demonstrations.minari_io"},
 }
 
