@@ -111,7 +111,9 @@ class Rise:
             "beta": LogRange(0.01, 0.1),  # less does as PC-BC, more costs too much on true readings
             "n_samples": Choice((4, 8)),
             "average": Choice((1, 16)),
-        }
+        },
+        # About as many latents as a reading has numbers: 7 here, 5 on the vehicle.
+        "RISE-SafePanda-v0": {"latent": Choice((4, 5, 6, 7)), "beta": LogRange(0.005, 0.1)},
     }
     ACTING: ClassVar[frozenset[str]] = frozenset({"average", "posterior"})
     learns_from = "demonstrations"
