@@ -36,6 +36,7 @@ _COLOURS = {
     **{"expert": "#7F7F7F", "random": "#BDBDBD"},
 }
 _SPARE_COLOURS = ("#D55E00", "#56B4E9", "#7B5BA6", "#8C6D1F", "#A3423C")
+_GREYS = ("#7F7F7F", "#A6A6A6", "#595959")
 _MARKERS = "osD^vPX*<>"
 INK, FAINT, GRID = "#222222", "#6A6A6A", "#E6E6E6"
 _WIDTH = 10.0  # inches
@@ -212,11 +213,13 @@ def save_png(figure: Figure, path: StrPath, dpi: int = 160) -> None:
 
 
 def colour(agents: Sequence[str], agent: str) -> str:
-    """The colour of an agent: known ones always have the same, others take the spare ones in turn."""
+    """The colour of an agent: known ones always have the same, others take spare ones in turn, references greys."""
     if agent in _COLOURS:
         return _COLOURS[agent]
-    others = [name for name in agents if name not in _COLOURS]
-    return spare_colour(others.index(agent))
+    grey = is_reference(agent)
+    others = [name for name in agents if name not in _COLOURS and is_reference(name) == grey]
+    place = others.index(agent)
+    return _GREYS[place % len(_GREYS)] if grey else spare_colour(place)
 
 
 def spare_colour(place: int) -> str:

@@ -132,6 +132,15 @@ def test_groups_stand_under_their_titles_with_the_rates_of_their_level(env):
         assert widths == pytest.approx([100 * getattr(row, f"{key}_rate") for row in shown])
 
 
+def test_references_are_grey_and_agents_are_not():
+    names = ["rise", "mine", "expert-cbf+kalman", "expert-mpc+kalman", "random", "theirs"]
+    colours = {name: plots.colour(names, name) for name in names}
+    for name, hexadecimal in colours.items():
+        red, green, blue = (hexadecimal[i : i + 2] for i in (1, 3, 5))
+        assert (red == green == blue) == labels.is_reference(name)
+    assert len(set(colours.values())) == len(names)
+
+
 def test_a_figure_of_no_groups_is_refused():
     with pytest.raises(ValueError, match="no rows to draw"):
         plots.grouped([])
