@@ -34,12 +34,11 @@ _WHOLE = np.iinfo(np.int16)
 
 def trajectory_jobs(plan: Plan, out: Path) -> list[Job]:
     """One job for each row that was asked for and noise level that is shown, of the first training seed and model."""
-    model, headline = plan.noise_models[0], min(plan.noise_levels, key=lambda x: (abs(x - 1), x))
+    model, headline = plan.headline()
     levels = sorted({min(plan.noise_levels), headline, max(plan.noise_levels)})
     jobs = []
     for env in filter(describes_task, plan.envs):  # the page draws what a task describes
-        asked = plan.described()[0]["rows"]
-        rows = [row for row, seed in plan.rows(env) if seed == 0 and row in asked]
+        rows = plan.asked(env)
         each = max(1, min(EACH, _EPISODES // (2 * max(1, len(rows) * len(levels)))))
         judged = [evaluated(plan, out, env, row, model, headline) for row in rows]
         for row in rows:

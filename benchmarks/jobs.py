@@ -25,7 +25,7 @@ from rise_agents.agent import Progress, acting_settings, config_to_dict, make_co
 from rise_agents.demonstrations import recording
 from rise_agents.resume import Resume
 from rise_agents.rollout import rollout
-from rise_envs.task import describes_task, env_class
+from rise_envs.task import describes_task
 
 _Actor = tuple[list[Any], dict[str, Any]]  # see actor_of
 PARTS = "parts"  # folder for the pieces of demonstrations that are being recorded
@@ -212,8 +212,8 @@ def evaluation_jobs(plan: Plan, out: Path) -> list[Job]:
     """One job for each row, noise model and level, and portion of the scenarios."""
     jobs = []
     for env in plan.envs:
-        for row, seed in plan.rows(env):
-            actor, met = actor_of(plan, env, row, seed, out), plan.conditions(env, row, seed)
+        for (row, seed), met in plan.measured(env).items():
+            actor = actor_of(plan, env, row, seed, out)
             for part in plan.chunks(env):
                 first, *others = (_evaluation(plan, out, actor, seed, *condition, part) for condition in met)
                 if split_row(row)[1] == TRUE:  # the same episodes under every condition: run once
@@ -262,13 +262,10 @@ def _needed(arguments: dict[str, Any]) -> tuple[Path, ...]:
 
 def video_jobs(plan: Plan, out: Path) -> list[Job]:
     """One clip for each row that was asked for, of its first training seed, at the headline noise level."""
-    headline, model = min(plan.noise_levels, key=lambda x: (abs(x - 1), x)), plan.noise_models[0]
+    model, headline = plan.headline()
     jobs = []
     for env in filter(draws, plan.envs):
-        asked = plan.described()[0]["rows"]
-        for row, seed in plan.rows(env):
-            if seed or row not in asked or "rgb_array" not in env_class(env).metadata["render_modes"]:
-                continue
+        for row in plan.asked(env):
             level = 0.0 if split_row(row)[1] == TRUE else headline
             source, arguments = actor_of(plan, env, row, 0, out)
             seeds = [int(s) for s in Scenarios(0, min(plan.clips, plan.episodes)).seeds()]

@@ -130,6 +130,11 @@ def count(values: Iterable[int], noun: str) -> str:
     return f"{text} {noun}" if counts[-1] == 1 else f"{text} {noun}s"
 
 
+def headline(levels: Iterable[float]) -> float:
+    """The noise level that figures, clips and sentences speak of: the paper's, 1, or the one nearest it."""
+    return min(levels, key=lambda level: (abs(level - 1), level))
+
+
 def several_seeds(rows: Iterable[SummaryRow]) -> bool:
     """Whether intervals of ``rows`` are the bootstrap's over training seeds and scenarios, not Wilson's."""
     return any(row.train_seeds > 1 for row in rows)

@@ -16,7 +16,7 @@ from typing import Any
 
 from benchmarks import configs
 from benchmarks.configs import Settings, Variant
-from benchmarks.labels import REFERENCES, TRUE, split_row
+from benchmarks.labels import REFERENCES, TRUE, headline, split_row
 from benchmarks.presets import PRESETS, Block, Preset
 from rise_agents import AGENTS, agent_class, pretrained
 from rise_agents.agent import nearest
@@ -176,7 +176,7 @@ class Plan:
 
     def rows(self, env: str) -> list[tuple[str, int]]:
         """(row name, training seed) of everything that is evaluated in an environment."""
-        return list(self._conditions(env))
+        return list(self.measured(env))
 
     def _rows(self, block: Block, env: str) -> list[tuple[str, int]]:
         """Those of a block."""
@@ -198,12 +198,20 @@ class Plan:
         rows = [row for row, seed in self.rows(env) if seed == 0 and self.learns_from_expert(row)]
         return list(dict.fromkeys(self.expert_of(row) for row in rows))
 
+    def asked(self, env: str) -> list[str]:
+        """The rows that were asked for in an environment, without those that only blocks bring."""
+        return list(dict.fromkeys(row for row, _ in self._rows(self.all_blocks()[0], env)))
+
+    def headline(self) -> tuple[str, float]:
+        """(noise model, noise level) that clips and pages show."""
+        return self.noise_models[0], headline(self.noise_levels)
+
     def conditions(self, env: str, row: str, seed: int) -> list[tuple[str, float]]:
         """(noise model, noise level) of everything that a row is measured under; level 0 is of the first model."""
-        return self._conditions(env)[row, seed]
+        return self.measured(env)[row, seed]
 
-    def _conditions(self, env: str) -> dict[tuple[str, int], list[tuple[str, float]]]:
-        """The same for every row and training seed, in their order."""
+    def measured(self, env: str) -> dict[tuple[str, int], list[tuple[str, float]]]:
+        """The conditions of every row and training seed, in their order."""
         first = self.noise_models[0]
         found: dict[tuple[str, int], dict[tuple[str, float], None]] = {}
         for block in self.all_blocks():

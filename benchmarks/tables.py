@@ -13,7 +13,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from benchmarks import stats
-from benchmarks.labels import is_reference
+from benchmarks.labels import headline, is_reference
 from benchmarks.pages import csv_lines, csv_text
 from benchmarks.results import StrPath, atomic_write_text, group_edges, sort_rows
 
@@ -147,8 +147,8 @@ def summarise(rows: pa.Table, agents: Sequence[str] = ()) -> list[SummaryRow]:
 
 
 def headline_level(summary: Sequence[SummaryRow]) -> float:
-    """The noise level that figures and sentences speak of: the paper's, 1, or the measured one nearest it."""
-    return min({row.noise_level for row in summary}, key=lambda level: (abs(level - 1), level))
+    """The level that is spoken of (:func:`benchmarks.labels.headline`) of those that were measured."""
+    return headline(row.noise_level for row in summary)
 
 
 def write_table(path: StrPath, kind: type[Row], rows: Sequence[Row]) -> None:
