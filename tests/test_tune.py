@@ -16,7 +16,7 @@ from scipy import stats
 from benchmarks.executors import Failure
 from benchmarks.tune import report, search, settings_file
 from benchmarks.tune.__main__ import main, parser, search_of
-from benchmarks.tune.ranking import Rates, best_clean, finalists, mean, ranked
+from benchmarks.tune.ranking import Rates, best_clean, finalists, mean, ranked, shown_loss
 from benchmarks.tune.studies import drawn_trials
 from rise_agents import AGENTS, agent_class, load_agent, make_agent
 from rise_agents.agent import make_config
@@ -31,6 +31,27 @@ VEHICLE, PANDA, MODEL = "RISE-GroundVehicle-v0", "RISE-SafePanda-v0", "RISE-Safe
 
 # --- the rule --------------------------------------------------------------------------------------------------
 
+MANY = 10**20  # episodes, of which rates are exact
+
+
+def test_a_loss_counts_as_far_as_its_episodes_show_it():
+    """A loss of exactly a point is called more than one in one of twenty cases."""
+    rng = np.random.default_rng(0)
+    draws = rng.binomial(1_000, [[0.96], [0.97]], (2, 20_000)) / 1_000
+    called = [shown_loss(own, best, 1_000) > 0.01 for own, best in draws.T]
+    assert np.mean(called) == pytest.approx(0.05, abs=0.006)
+    assert shown_loss(0.98, 0.99, MANY) == pytest.approx(0.01)
+    assert shown_loss(0.99, 0.98, 1000) < -0.01
+    assert shown_loss(1.0, 1.0, 3) == 0.0
+    best = Rates(1.0, 0.99, 0.5, 0.5)
+    rates = {
+        0: Rates(0.995, 0.985, 0.6, 0.6),
+        1: Rates(0.995, 0.975, 0.9, 0.9),
+    }  # loses 0.5, 1.5 points of Reach
+    assert ranked(rates, 0.01, best, 1_000) == [1, 0]
+    assert ranked(rates, 0.01, best, 10_000) == [0, 1]
+    assert finalists(rates, 0.01, best, 1_000, 4) == [1] and finalists(rates, 0.01, best, 10_000, 4) == [0]
+
 
 def test_the_best_score_wins_among_those_that_see_as_well_as_the_best():
     rates = {
@@ -39,41 +60,41 @@ def test_the_best_score_wins_among_those_that_see_as_well_as_the_best():
         2: Rates(0.99, 0.96, 0.95, 0.95),  # loses two points of Reach
         3: Rates(0.97, 0.98, 0.99, 0.99),  # loses two points of Safety
     }
-    assert ranked(rates, 0.01, rates[0]) == [1, 0, 3, 2]
-    assert ranked(rates, 0.02, rates[0]) == [3, 2, 1, 0]
-    assert ranked(rates, 0.0, rates[0]) == [0, 1, 3, 2]  # who loses less comes first
+    assert ranked(rates, 0.01, rates[0], MANY) == [1, 0, 3, 2]
+    assert ranked(rates, 0.02, rates[0], MANY) == [3, 2, 1, 0]
+    assert ranked(rates, 0.0, rates[0], MANY) == [0, 1, 3, 2]  # who loses less comes first
 
 
 def test_what_another_agent_can_do_when_it_sees_well_none_may_give_up():
     rates = {0: Rates(0.99, 0.98, 0.80, 0.78), 1: Rates(0.98, 0.97, 0.90, 0.90)}
-    assert ranked(rates, 0.01, rates[0]) == [1, 0]
-    assert ranked(rates, 0.01, Rates(0.995, 0.98, 0.1, 0.1)) == [
+    assert ranked(rates, 0.01, rates[0], MANY) == [1, 0]
+    assert ranked(rates, 0.01, Rates(0.995, 0.98, 0.1, 0.1), MANY) == [
         0,
         1,
     ]  # 1 is 1.5 points less safe than the other agent
-    assert ranked(rates, 0.01, Rates(1.0, 1.0, 0.1, 0.1)) == [0, 1]  # neither is eligible: 0 loses less
+    assert ranked(rates, 0.01, Rates(1.0, 1.0, 0.1, 0.1), MANY) == [0, 1]  # neither is eligible: 0 loses less
 
 
 def test_the_reference_is_the_best_mean_on_true_readings():
     rates = {0: Rates(1.0, 0.5, 0.9, 0.9), 1: Rates(0.9, 0.9, 0.1, 0.1)}
     assert best_clean(rates.values()) == rates[1]  # 0.9 beats 0.75
-    assert ranked(rates, 0.01, rates[1]) == [1, 0]  # trial 0 loses 40 points of Reach
+    assert ranked(rates, 0.01, rates[1], MANY) == [1, 0]  # trial 0 loses 40 points of Reach
     equal = [Rates(0.9, 0.9, 0.1, 0.1), Rates(0.9, 0.9, 0.2, 0.1)]
     assert best_clean(equal) == equal[1]
 
 
 def test_of_equal_trials_the_lower_number_is_better():
     same = Rates(0.9, 0.9, 0.8, 0.8)
-    assert ranked({5: same, 2: same, 0: same}, 0.01, same) == [0, 2, 5]
-    assert ranked({}, 0.01, same) == []
+    assert ranked({5: same, 2: same, 0: same}, 0.01, same, MANY) == [0, 2, 5]
+    assert ranked({}, 0.01, same, MANY) == []
 
 
 def test_a_quarter_goes_on_even_if_fewer_are_eligible():
     rates = {n: Rates(0.9 if n else 1.0, 0.9, 0.5 + n / 100, 0.5) for n in range(8)}
-    assert finalists(rates, 0.01, rates[0], 8) == [0, 7]
-    assert len(finalists(rates, 0.01, rates[0], 5)) == 2
-    assert finalists({3: rates[3]}, 0.01, rates[0], 8) == [3]
-    assert finalists({}, 0.01, rates[0], 8) == []
+    assert finalists(rates, 0.01, rates[0], MANY, 8) == [0, 7]
+    assert len(finalists(rates, 0.01, rates[0], MANY, 5)) == 2
+    assert finalists({3: rates[3]}, 0.01, rates[0], MANY, 8) == [3]
+    assert finalists({}, 0.01, rates[0], MANY, 8) == []
 
 
 def test_means_and_scores():

@@ -66,7 +66,7 @@ def comments(found: Found, command: Sequence[str], clean_loss: float) -> list[st
         f"  {shlex.join(command)}",
         f"{count} settings with training seed 0, the best 1 in {KEPT} with seeds {seeds}; {_source(study)}.",
         f"{study.scenarios} validation scenarios of {study.eval_env}, noise {MODEL}: the best score at level 1",
-        f"among those that lose at most {100 * clean_loss:g} points to the best of all agents at level 0.",
+        f"among those not shown to lose more than {100 * clean_loss:g} points to the best of all agents at level 0.",
         f"Mean over seeds {seeds}: {_told(found.rates)}.",
     ]
     if found.defaults is not None:

@@ -142,7 +142,7 @@ def execute(search: Search, sets: Mapping[str, tuple[Path, str]], out: Path, how
     rates = {study: _measured(study, first[study], [0], out) for study in studies}
     best = _best(rates)
     second = {
-        study: finalists(rates[study], search.clean_loss, best[study.env], len(study.trials))
+        study: finalists(rates[study], search.clean_loss, best[study.env], study.scenarios, len(study.trials))
         for study in studies
         if rates[study]
     }
@@ -154,7 +154,8 @@ def execute(search: Search, sets: Mapping[str, tuple[Path, str]], out: Path, how
     best = _best(finals)
     for study, final in finals.items():
         if final:
-            chosen = ranked(final, search.clean_loss, best[study.env])[0]
+            episodes = study.scenarios * len(seeds)
+            chosen = ranked(final, search.clean_loss, best[study.env], episodes)[0]
             trials = tuple(second[study])
             numbers = (chosen, final[chosen], rates[study].get(0), trials, len(seeds), len(rates[study]))
             found.append(report.Found(study, *numbers))
