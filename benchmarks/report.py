@@ -365,6 +365,7 @@ def read_run(folder: Path) -> dict[str, Any]:
             "rows": [str(name) for name in record.get("rows", record["plan"]["agents"])],
             "training": dict(record.get("training", {})),
             "labels": {name: str(each["label"]) for name, each in variants if each["label"]},
+            "variants": {name: str(each["agent"]) for name, each in variants},
             "unfinished": int(record.get("unfinished", 0)),
             "blocks": [_block(each) for each in record.get("blocks", ())],
             "agents": {env: dict(paths) for env, paths in dict(record.get("agents", {})).items()},
