@@ -6,7 +6,6 @@ It reads a run folder, whenever that was made, so that neither trainings nor wor
 from __future__ import annotations
 
 import importlib.util
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,7 @@ from typing import Any
 from benchmarks import report, results
 from benchmarks.html_report import curve
 from benchmarks.labels import count, split_row
-from rise_agents.cli import Parser
+from rise_agents.cli import Parser, at_work, command
 
 _EXAMPLES = """\
 examples:
@@ -160,28 +159,17 @@ def parser() -> Parser:
     return p
 
 
+@command("benchmarks.upload", interrupted="interrupted; give the command again")
 def main(argv: Sequence[str] | None = None) -> int:
     """Upload; returns the exit code: 0 done, 1 it could not be sent, 2 bad input, 130 interrupted."""
-    try:
-        a = parser().parse_args(argv)
-        trainings = tracked(a.run)
-        if not trainings:
-            raise ValueError(f"{str(a.run)!r} has no training that has ended")
-        if importlib.util.find_spec("wandb") is None:
-            raise ValueError("this needs one more package: pip install 'rise-suite[wandb]'")
-    except ValueError as error:
-        print(f"benchmarks.upload: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        return 130
-    try:
+    a = parser().parse_args(argv)
+    trainings = tracked(a.run)
+    if not trainings:
+        raise ValueError(f"{str(a.run)!r} has no training that has ended")
+    if importlib.util.find_spec("wandb") is None:
+        raise ValueError("this needs one more package: pip install 'rise-suite[wandb]'")
+    with at_work(Exception):  # of a library that has many kinds, most of a network
         send(trainings, a.run, a.project, a.entity, a.offline)
-    except KeyboardInterrupt:
-        print("\nbenchmarks.upload: interrupted; give the command again", file=sys.stderr)
-        return 130
-    except Exception as error:  # of a library that has many, most of a network
-        print(f"benchmarks.upload: {type(error).__name__}: {error}", file=sys.stderr)
-        return 1
     where = f"{a.run / 'wandb'}: wandb sync sends it" if a.offline else f"project {a.project}"
     print(f"{count([len(trainings)], 'training')} in {where}")
     return 0
