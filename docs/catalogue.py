@@ -9,7 +9,7 @@ import inspect
 import io
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -41,7 +41,9 @@ BESIDE = {  # pages that stand beside ``docs``: what they are on the site
 }
 
 _LINK = re.compile(r"\[([^\]]*)\]\(([^)\s]+\.py)\)")
-_IMPORT = re.compile(r"^(?:from|import) ((?:rise_envs|rise_agents|benchmarks)[\w.]*)(?: import ([\w, ]+))?", re.M)
+_IMPORT = re.compile(
+    r"^(?:from|import) ((?:rise_envs|rise_agents|benchmarks)[\w.]*)(?: import ([\w, ]+))?", re.M
+)
 
 
 # --- pieces of pages -------------------------------------------------------------------------------------------
@@ -52,8 +54,11 @@ def first_line(thing: Any) -> str:
     return " ".join((inspect.getdoc(thing) or "").partition("\n\n")[0].split())
 
 
-def in_markdown(text: str) -> str:
-    """Text with the roles of reStructuredText as MyST writes them, and its double backticks single."""
+def in_markdown(text: str, module: str = "") -> str:
+    """Text of a module's docstring with the roles of reStructuredText as MyST writes them."""
+    text = re.sub(
+        r"(?<!:)(?<!\w):(\w+):`(\w+)`", rf"{{py:\1}}`\2 <{module}.\2>`", text
+    )  # names of the module
     text = re.sub(r"(?<!:)(?<!\w):(\w+):`", r"{py:\1}`", text)
     return re.sub(r"``([^`]+)``", r"`\1`", text)
 
@@ -69,20 +74,27 @@ def table(header: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
     return markdown_table(header, ["---"] * len(header), cells)
 
 
-def helps(kind: type) -> dict[str, str]:
+def helps(kind: Any) -> dict[str, str]:
     """What the docstrings of a dataclass and of its bases say of each field."""
     said: dict[str, str] = {}
     for base in reversed(kind.__mro__):
         for each in parse(base.__doc__ or "", DocstringStyle.GOOGLE).params:
-            said[each.arg_name] = in_markdown(" ".join((each.description or "").split()))
+            said[each.arg_name] = in_markdown(" ".join((each.description or "").split()), base.__module__)
     return said
 
 
-def settings(kind: Any, skip: Iterable[str] = ()) -> str:
+def settings(kind: Any) -> str:
     """The table of a dataclass's fields: name, default, what for."""
     said = helps(kind)
-    rows = [(f"`{f.name}`", f"`{value(f.default)}`", said.get(f.name, "")) for f in fields(kind) if f.name not in skip]
+    rows = [(f"`{name}`", f"`{value(default)}`", said.get(name, "")) for name, default in defaults(kind)]
     return table(("setting", "default", ""), rows)
+
+
+def defaults(kind: Any) -> list[tuple[str, Any]]:
+    """Fields of a dataclass, with their defaults."""
+    return [
+        (f.name, f.default if f.default_factory is MISSING else f.default_factory()) for f in fields(kind)
+    ]
 
 
 def value(given: Any) -> str:
@@ -130,7 +142,11 @@ def environments() -> dict[str, str]:
     parts = []
     for env_id in ENVS:
         kind = env_class(env_id)
-        parts += [f"## [{env_id}](environments/{env_id}.md)", in_markdown(first_line(kind)), env_picture(env_id)]
+        parts += [
+            f"## [{env_id}](environments/{env_id}.md)",
+            in_markdown(first_line(kind)),
+            env_picture(env_id),
+        ]
     guide = "All of these, side by side, and how they are used: [the guide](../environments.md)."
     tree = toctree(f"environments/{env_id}" for env_id in ENVS)
     return pages | {"environments.md": page("# All environments", guide, *parts, tree)}
@@ -214,7 +230,7 @@ def agents() -> dict[str, str]:
 
 def first_sentence(kind: Any) -> str:
     """What an agent is: the first line of its class or, where that says little, of its module."""
-    return in_markdown(first_line(inspect.getmodule(kind)) or first_line(kind))
+    return in_markdown(first_line(inspect.getmodule(kind)) or first_line(kind), kind.__module__)
 
 
 def agent(name: str) -> str:
@@ -239,8 +255,13 @@ def agent(name: str) -> str:
     if mine := [f"`{each}`" for each, variant in found.items() if variant.agent == name]:
         facts.append(("[variants](../../benchmark.md#variants)", ", ".join(mine)))
     return page(
-        f"# {name}", "\n".join(filter(None, shown)), rst(said, kind.__module__), make, table(("", ""), facts),
-        "## Settings", settings(kind.Config),
+        f"# {name}",
+        "\n".join(filter(None, shown)),
+        rst(said, kind.__module__),
+        make,
+        table(("", ""), facts),
+        "## Settings",
+        settings(kind.Config),
     )
 
 
@@ -252,7 +273,11 @@ def pairs(given: Mapping[str, Any]) -> str:
 def experts() -> dict[str, str]:
     """The page of experts and filters."""
     rows = [(f"`{env_id}`", f"`{name}`", link(entry)) for (env_id, name), entry in EXPERTS.items()]
-    parts = ["# Experts and filters", "[The guide](../agents.md#experts) says how they are used.", "## Experts"]
+    parts = [
+        "# Experts and filters",
+        "[The guide](../agents.md#experts) says how they are used.",
+        "## Experts",
+    ]
     parts += [table(("environment", "expert", "class"), rows), *classes(EXPERTS.values())]
     parts += ["## Filters", table(("filter", "class"), [(f"`{n}`", link(e)) for n, e in FILTERS.items()])]
     return {"experts.md": page(*parts, *classes(FILTERS.values()))}
@@ -274,13 +299,18 @@ def noise() -> dict[str, str | bytes]:
     rows = []
     for name, kind in NOISE_MODELS.items():
         said = helps(kind)
-        given = [f"`{f.name}` = {value(f.default)}: {said.get(f.name, '')}" for f in fields(kind)]  # type: ignore[arg-type]
+        given = [f"`{name}` = {value(default)}: {said.get(name, '')}" for name, default in defaults(kind)]
         entry = f"{kind.__module__}:{kind.__qualname__}"
-        rows.append((f"`{name}`", link(entry), in_markdown(first_line(kind)), "; ".join(given)))
+        rows.append(
+            (f"`{name}`", link(entry), in_markdown(first_line(kind), kind.__module__), "; ".join(given))
+        )
     about = "How they are written, added up and limited to some channels: [the guide](../noise.md)."
     words = "A reading that moves (line) and what each model makes of it (dots), noise_scale 1"
     text = page(
-        "# All noise models", about, table(("name", "class", "", "parameters"), rows), f"![{words}](noise.png)"
+        "# All noise models",
+        about,
+        table(("name", "class", "", "parameters"), rows),
+        f"![{words}](noise.png)",
     )
     return {"noise.md": text, "noise.png": noise_picture()}
 
@@ -289,7 +319,7 @@ def noise_picture(steps: int = 60) -> bytes:
     """A panel for each noise model: one reading over time, true and noisy."""
     from matplotlib.figure import Figure
 
-    true = 4 * np.sin(np.linspace(0, 5, steps))
+    true = 4 * np.sin(np.linspace(0, 12, steps))
     across = 2
     down = -(-len(NOISE_MODELS) // across)
     figure = Figure(figsize=(8, 1.6 * down), layout="constrained")
@@ -373,7 +403,10 @@ def api() -> dict[str, str]:
     parts = ["# API", "Modules that are imported from, or that a page speaks of. `[source]` shows the code."]
     for package in PACKAGES:
         mine = [name for name in known if name.partition(".")[0] == package]
-        rows = [(f"[`{name}`](api/{name}.md)", in_markdown(first_line(import_module(name)))) for name in mine]
+        rows = [
+            (f"[`{name}`](api/{name}.md)", in_markdown(first_line(import_module(name)), name))
+            for name in mine
+        ]
         parts += [f"## {package}", table(("module", ""), rows)]
     return {f"api/{name}.md": module_page(name, private) for name, private in known.items()} | {
         "api.md": page(*parts)
@@ -410,7 +443,14 @@ def beside() -> dict[str, str]:
 
 def write(folder: Path) -> None:
     """Write all pages; what has not changed is left as it is, what is no page any more is removed."""
-    pages: dict[str, str | bytes] = {**environments(), **agents(), **experts(), **noise(), **api(), **beside()}
+    pages: dict[str, str | bytes] = {
+        **environments(),
+        **agents(),
+        **experts(),
+        **noise(),
+        **api(),
+        **beside(),
+    }
     for path in folder.rglob("*.*"):
         if path.relative_to(folder).as_posix() not in pages:
             path.unlink()
@@ -419,5 +459,3 @@ def write(folder: Path) -> None:
         if not path.exists() or path.read_bytes() != data:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(data)
-
-

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import re
 import sys
-from functools import reduce
+from functools import cache, reduce
 from pathlib import Path
 from typing import Any
 
 from docutils import nodes
+from numpy.typing import ArrayLike
 from sphinx import addnodes
 from sphinx.application import Sphinx
 from sphinx.transforms import SphinxTransform
+from sphinx.util.nodes import make_refnode
+from sphinx.util.typing import stringify_annotation
 
 HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE), str(HERE.parent)]
@@ -35,6 +39,7 @@ nitpicky = True
 autodoc_member_order = "bysource"
 autodoc_default_options = {"no-value": True}
 autodoc_typehints_format = "short"
+add_module_names = False
 python_use_unqualified_type_names = True
 napoleon_use_ivar = True  # an attribute that a class docstring lists is not described twice
 
@@ -46,7 +51,7 @@ html_css_files = ["site.css"]
 
 
 class Links(SphinxTransform):
-    """Links to files of the repository lead to what the site has of them."""
+    """Links to files of the repository lead to what the site has of them, names to where they are defined."""
 
     default_priority = 400  # before downloads are collected
 
@@ -55,51 +60,76 @@ class Links(SphinxTransform):
         for node in list(self.document.findall(addnodes.download_reference)):
             path = (Path(self.env.doc2path(node["refdoc"])).parent / node["reftarget"]).resolve()
             if module := catalogue.module_of(path):
-                name = node.astext() if isinstance(node.next_node(nodes.literal), nodes.literal) else ""
-                inside = module if name in ("", path.name) else f"{module}.{name}"
-                kind = "mod" if inside == module else "obj"
-                target = {"refdomain": "py", "reftype": kind, "reftarget": inside, "refdoc": node["refdoc"]}
-                node.replace_self(addnodes.pending_xref("", *node.children, refexplicit=True, **target))
+                words = node.astext() if isinstance(node.next_node(nodes.literal), nodes.literal) else ""
+                named = all(part.isidentifier() for part in words.split("."))
+                lead(node, "py", "obj", f"{module}.{words}" if named else module)
             elif path.suffix == ".py":
-                self._lead(node, f"{catalogue.FOLDER}/examples/{path.stem}", None)
+                lead(node, "doc", "myst", f"{catalogue.FOLDER}/examples/{path.stem}")
         for node in list(self.document.findall(addnodes.pending_xref)):
             name = Path(node["reftarget"].partition("#")[0]).name
             beside = name if name.endswith(".md") else f"{name}.md"
             if node["reftype"] == "myst" and beside in catalogue.BESIDE:
-                self._lead(node, catalogue.BESIDE[beside], node.get("reftargetid"))
-
-    def _lead(self, node: nodes.Element, page: str, anchor: str | None) -> None:
-        about = {"refdomain": "doc", "reftype": "myst", "reftarget": page, "reftargetid": anchor}
-        to = addnodes.pending_xref("", *node.children, refexplicit=True, refdoc=node["refdoc"], **about)
-        node.replace_self(to)
+                lead(node, "doc", "myst", catalogue.BESIDE[beside], node.get("reftargetid"))
+            elif node["refdomain"] == "py":
+                node["reftarget"] = home(node) or node["reftarget"]
 
 
-def found(name: str) -> bool:
-    """Whether there is such a module, or such a name in one."""
+def lead(node: nodes.Element, domain: str, kind: str, target: str, anchor: str | None = None) -> None:
+    """Put a reference in the place of another one, with its words."""
+    where = {"refdoc": node["refdoc"], "refexplicit": True, "refwarn": True, "reftargetid": anchor}
+    about = {"refdomain": domain, "reftype": kind, "reftarget": target}
+    node.replace_self(addnodes.pending_xref("", *node.children, **about, **where))
+
+
+def home(node: nodes.Element) -> str | None:
+    """The full name of what a reference means, as Python finds it from where it stands; None: nothing.
+
+    What a package hands on is at home where it is defined.
+    """
+    target, module = node["reftarget"].lstrip("."), node.get("py:module")
+    places = [f"{module}.{node.get('py:class')}", module, module.rpartition(".")[0]] if module else []
+    for name in [*(f"{place}.{target}" for place in places), target, f"builtins.{target}"]:
+        thing = found(name)
+        if thing is not None:
+            origin = getattr(thing, "__module__", None), getattr(thing, "__qualname__", None)
+            ours = name.partition(".")[0] in catalogue.PACKAGES and all(
+                isinstance(part, str) for part in origin
+            )
+            return ".".join(map(str, origin)) if ours else name
+    return None
+
+
+@cache
+def found(name: str) -> Any:
+    """The module, or the thing in one, that has this full name; None: there is none."""
     parts = name.split(".")
     for cut in range(len(parts), 0, -1):
         try:
-            module = importlib.import_module(".".join(parts[:cut]))
-        except (ImportError, ValueError):
+            return reduce(getattr, parts[cut:], importlib.import_module(".".join(parts[:cut])))
+        except (ImportError, AttributeError, ValueError):
             continue
-        try:
-            return reduce(getattr, parts[cut:], module) is not None
-        except AttributeError:
-            continue
-    return False
+    return None
 
 
-def name_without_page(app: Sphinx, env: Any, node: nodes.Element, content: nodes.Element) -> Any:
-    """What exists but has no page of its own here is shown without a link; what does not exist stays an error."""
-    if node.get("refdomain") != "py":
+def without_page(app: Sphinx, env: Any, node: nodes.Element, content: nodes.Element) -> Any:
+    """What exists without a description here leads to what holds it; what does not exist stays an error."""
+    if node["refdomain"] != "py":
         return None
-    target, module, inside = node["reftarget"].lstrip("."), node.get("py:module"), node.get("py:class")
-    package = module.rpartition(".")[0] if module else ""
-    places = [module and inside and f"{module}.{inside}", module, package, "builtins", "typing"]
-    if any(found(".".join((place, target))) for place in places if place) or found(target):
+    name, known = node["reftarget"], env.domains.python_domain
+    if found(name) is None and not for_annotations(name.partition(".")[0], node.get("py:module")):
+        return None
+    while name and name not in known.objects:
+        name = name.rpartition(".")[0]
+    if not name:
         return content
-    typing_only = module and f"import {target}\n" in inspect.getsource(importlib.import_module(module))
-    return content if typing_only else None
+    there = known.objects[name]
+    return make_refnode(app.builder, node["refdoc"], there.docname, there.node_id, content, name)
+
+
+def for_annotations(name: str, module: str | None) -> bool:
+    """Whether a module imports ``name`` for annotations alone: nobody can find it there at run time."""
+    text = inspect.getsource(importlib.import_module(module)) if module else ""
+    return bool(re.search(rf"^    (from|import) .*\b{re.escape(name)}\b", text, re.MULTILINE))
 
 
 def without_markdown(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
@@ -116,6 +146,16 @@ def without_fields(app: Sphinx, what: str, name: str, thing: Any, skip: bool, op
     return True if str(getattr(thing, "__doc__", "")).startswith("Alias for field number") else None
 
 
+def with_short_arrays(app: Sphinx, what: str, name: str, thing: Any, options: Any, *texts: str | None) -> Any:
+    """Signatures say ``NDArray`` and ``ArrayLike``, as the code does, not what NumPy makes of them."""
+    array = r"~numpy\.ndarray\[tuple\[~typing\.Any, \.\.\.\], ~numpy\.dtype\[([^\[\]]*)\]\]"
+    like = re.escape(stringify_annotation(ArrayLike, "smart"))
+    return tuple(
+        text and re.sub(array, r"~numpy.typing.NDArray[\1]", re.sub(like, "~numpy.typing.ArrayLike", text))
+        for text in texts
+    )
+
+
 def only_what_is_there(app: Sphinx, docname: str, source: list[str]) -> None:
     """Results are on the site once they are published."""
     if docname == "index" and not (HERE / "results" / "README.md").exists():
@@ -124,9 +164,10 @@ def only_what_is_there(app: Sphinx, docname: str, source: list[str]) -> None:
 
 def setup(app: Sphinx) -> None:
     """Connect what is above; called by Sphinx."""
-    app.connect("builder-inited", lambda app: catalogue.write(HERE / catalogue.FOLDER))
+    app.connect("builder-inited", lambda app: catalogue.write(Path(app.srcdir) / catalogue.FOLDER))
     app.connect("source-read", only_what_is_there)
     app.connect("autodoc-process-docstring", without_markdown)
+    app.connect("autodoc-process-signature", with_short_arrays)
     app.connect("autodoc-skip-member", without_fields)
-    app.connect("missing-reference", name_without_page)
+    app.connect("missing-reference", without_page)
     app.add_transform(Links)

@@ -1,11 +1,11 @@
 """RISE: Robust Imitation through Stochastic Encoding (Tayal, Tayal and Prakash), Algorithm 1.
 
-Stage 1 trains a variational autoencoder on the readings c with the negative ELBO
+Stage 1 trains a variational autoencoder on the readings c with the negative ELBO ::
 
     L = −log p_ψ(c | z) + β KL[q_φ(z | c) ‖ N(0, I)],   z = μ + σ ⊙ ε,   ε ~ N(0, I),
 
 where p_ψ is a Gaussian whose deviation is the sensor's noise at level 1: reconstruction errors count in units
-of the reading noise. Stage 2 freezes it and clones the expert's action a with a policy π_θ(s, g, z),
+of the reading noise. Stage 2 freezes it and clones the expert's action a with a policy π_θ(s, g, z) ::
 
     L_π = 1/M Σ_m ℓ(π_θ(s, g, z⁽ᵐ⁾), a),   z⁽ᵐ⁾ = μ + σ ⊙ ε⁽ᵐ⁾,
 

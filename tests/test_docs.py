@@ -111,8 +111,8 @@ def member(file: Path, name: str) -> Any:
 def script(page: Path, folder: Path) -> str:
     """What a reader of a page would run, at the lines of the page, so that tracebacks name them.
 
-    Python as it stands; blocks that are marked ``file=NAME`` are saved in ``folder``; of the commands in tutorials those
-    that say where their output goes.
+    Python as it stands; blocks that are marked ``file=NAME`` are saved in ``folder``; of the commands in tutorials
+    those that say where their output goes.
     """
     lines, inside, saved = [], "", None
     for line in page.read_text().splitlines():
@@ -146,7 +146,12 @@ def test_snippets_run(page, tmp_path, monkeypatch, own_names):
 
 @pytest.mark.parametrize(
     "command",
-    [line for page in TUTORIALS for line in page.read_text().splitlines() if line.startswith("rise-bench run")],
+    [
+        line
+        for page in TUTORIALS
+        for line in page.read_text().splitlines()
+        if line.startswith("rise-bench run")
+    ],
 )
 def test_commands_of_tutorials_are_accepted(command, monkeypatch, tmp_path, own_names):
     monkeypatch.chdir(tmp_path)
