@@ -153,9 +153,13 @@ def environments() -> dict[str, str]:
 
 
 def env_picture(env_id: str) -> str:
-    """An episode of the environment or, of a stand-in, of what it models."""
-    drawn = env_id if (HERE / "images" / "envs" / f"{env_id}.gif").exists() else STAND_INS.get(env_id, env_id)
-    return picture("envs", drawn, f"An expert in {drawn}; dashed or translucent: the noisy reading")
+    """An episode of the environment or, of a stand-in that draws nothing, of what it models."""
+    own = picture("envs", env_id, f"An expert in {env_id}; dashed or translucent: the noisy reading")
+    if own or env_id not in STAND_INS:
+        return own
+    modelled = STAND_INS[env_id]
+    there = picture("envs", modelled, f"An expert in {modelled}")
+    return f"{there}\n\n*Drawn by {modelled}, which it models.*" if there else ""
 
 
 def environment(env_id: str) -> str:

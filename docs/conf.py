@@ -87,8 +87,9 @@ def home(node: nodes.Element) -> str | None:
     What a package hands on is at home where it is defined.
     """
     target, module = node["reftarget"].lstrip("."), node.get("py:module")
-    places = [f"{module}.{node.get('py:class')}", module, module.rpartition(".")[0]] if module else []
-    for name in [*(f"{place}.{target}" for place in places), target, f"builtins.{target}"]:
+    module = module or ""
+    places = (f"{module}.{node.get('py:class')}", module, module.rpartition(".")[0])
+    for name in [*(f"{place}.{target}" for place in places if module and place), target, f"builtins.{target}"]:
         thing = found(name)
         if thing is not None:
             origin = getattr(thing, "__module__", None), getattr(thing, "__qualname__", None)
