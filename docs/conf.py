@@ -39,6 +39,8 @@ nitpicky = True
 autodoc_member_order = "bysource"
 autodoc_default_options = {"no-value": True}
 autodoc_typehints_format = "short"
+autodoc_preserve_defaults = True
+default_role = "literal"
 add_module_names = False
 python_use_unqualified_type_names = True
 napoleon_use_ivar = True  # an attribute that a class docstring lists is not described twice
@@ -89,7 +91,11 @@ def home(node: nodes.Element) -> str | None:
     target, module = node["reftarget"].lstrip("."), node.get("py:module")
     module = module or ""
     places = (f"{module}.{node.get('py:class')}", module, module.rpartition(".")[0])
-    for name in [*(f"{place}.{target}" for place in places if module and place), target, f"builtins.{target}"]:
+    for name in [
+        *(f"{place}.{target}" for place in places if module and place),
+        target,
+        f"builtins.{target}",
+    ]:
         thing = found(name)
         if thing is not None:
             origin = getattr(thing, "__module__", None), getattr(thing, "__qualname__", None)
@@ -142,19 +148,26 @@ def without_markdown(app: Sphinx, what: str, name: str, thing: Any, options: Any
         lines[:] = [*said, "", *more]
 
 
-def without_fields(app: Sphinx, what: str, name: str, thing: Any, skip: bool, options: Any) -> bool | None:
-    """Fields of named tuples are told by their class."""
-    return True if str(getattr(thing, "__doc__", "")).startswith("Alias for field number") else None
+def without_repetition(
+    app: Sphinx, what: str, name: str, thing: Any, skip: bool, options: Any
+) -> bool | None:
+    """Fields of named tuples are told by their class, and a class that is an attribute where it is defined."""
+    field = str(getattr(thing, "__doc__", "")).startswith("Alias for field number")
+    return (
+        True if field or (what == "class" and inspect.isclass(thing) and thing.__qualname__ == name) else None
+    )
 
 
 def with_short_arrays(app: Sphinx, what: str, name: str, thing: Any, options: Any, *texts: str | None) -> Any:
     """Signatures say ``NDArray`` and ``ArrayLike``, as the code does, not what NumPy makes of them."""
     array = r"~numpy\.ndarray\[tuple\[~typing\.Any, \.\.\.\], ~numpy\.dtype\[([^\[\]]*)\]\]"
-    like = re.escape(stringify_annotation(ArrayLike, "smart"))
-    return tuple(
-        text and re.sub(array, r"~numpy.typing.NDArray[\1]", re.sub(like, "~numpy.typing.ArrayLike", text))
-        for text in texts
-    )
+    like, any_array = stringify_annotation(ArrayLike, "smart"), "~numpy.typing.NDArray"
+
+    def short(text: str) -> str:
+        text = re.sub(array, rf"{any_array}[\1]", text.replace(like, "~numpy.typing.ArrayLike"))
+        return re.sub(r"NDArray\[[~\w.]*_ScalarT\]", "NDArray", text)
+
+    return tuple(text and short(text) for text in texts)
 
 
 def only_what_is_there(app: Sphinx, docname: str, source: list[str]) -> None:
@@ -169,6 +182,6 @@ def setup(app: Sphinx) -> None:
     app.connect("source-read", only_what_is_there)
     app.connect("autodoc-process-docstring", without_markdown)
     app.connect("autodoc-process-signature", with_short_arrays)
-    app.connect("autodoc-skip-member", without_fields)
+    app.connect("autodoc-skip-member", without_repetition)
     app.connect("missing-reference", without_page)
     app.add_transform(Links)

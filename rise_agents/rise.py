@@ -168,6 +168,7 @@ class Rise:
         return robot + c.latent, c.hidden, cloning.output_size(self.units.size, c.loss)
 
     def _fit_vae(self, vae: VAE, lesson: Lesson, ratio: Tensor, progress: Progress) -> None:
+        """Stage 1 (lines 1 to 10): the autoencoder learns the readings of the demonstrations."""
         from rise_agents.training import fit  # which imports torch
 
         c, seen = self.config, lesson.data.reading
@@ -191,6 +192,7 @@ class Rise:
     def _fit_policy(
         self, policy: nn.Module, lesson: Lesson, posterior: tuple[Tensor, Tensor], progress: Progress
     ) -> None:
+        """Stage 2 (lines 12 to 25): the policy learns their actions, on samples of the posterior."""
         from rise_agents.networks import policy_loss  # which imports torch
         from rise_agents.training import fit
 

@@ -114,7 +114,7 @@ def script(page: Path, folder: Path) -> str:
     Python as it stands; blocks that are marked ``file=NAME`` are saved in ``folder``; of the commands in tutorials
     those that say where their output goes.
     """
-    lines, inside, saved = [], "", None
+    lines, inside, saved, command = [], "", None, ""
     for line in page.read_text().splitlines():
         fence = re.fullmatch(r"```(\w*)(?: file=(\S+))?", line)
         if inside:
@@ -129,8 +129,13 @@ def script(page: Path, folder: Path) -> str:
                 saved.write_text("")
         runs = inside == "python" and not fence and not saved
         lines.append(line if runs else "")
-        if inside == "sh" and page in TUTORIALS and line.startswith("rise-bench") and "--out" in line:
-            lines[-1] = f"assert not __import__('benchmarks.cli').cli.main({shlex.split(line)[1:]})"
+        if inside == "sh" and page in TUTORIALS:
+            command += line.removesuffix("\\")
+            if line.endswith("\\"):
+                continue
+            if command.startswith("rise-bench") and "--out" in command:
+                lines[-1] = f"assert not __import__('benchmarks.cli').cli.main({shlex.split(command)[1:]})"
+            command = ""
     return "\n".join(lines)
 
 
@@ -144,20 +149,18 @@ def test_snippets_run(page, tmp_path, monkeypatch, own_names):
     runpy.run_path(str(path))
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
-        line
-        for page in TUTORIALS
-        for line in page.read_text().splitlines()
-        if line.startswith("rise-bench run")
-    ],
-)
+def tutorial_commands() -> list[str]:
+    """All commands of the benchmark that tutorials name, whether or not they are run."""
+    text = "\n".join(page.read_text() for page in TUTORIALS).replace("\\\n", " ")
+    return [line for line in text.splitlines() if line.startswith("rise-bench run")]
+
+
+@pytest.mark.parametrize("command", tutorial_commands())
 def test_commands_of_tutorials_are_accepted(command, monkeypatch, tmp_path, own_names):
     monkeypatch.chdir(tmp_path)
     if "linear.py" in command:
         script(DOCS / "tutorials" / "agent.md", tmp_path)  # saves the file
-    plan_of(parser().parse_args(shlex.split(command, comments=True)[2:]))
+    plan_of(parser().parse_args(shlex.split(command)[2:]))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=page_id)

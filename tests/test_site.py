@@ -187,7 +187,7 @@ def test_links_to_files_lead_to_pages_of_the_site(tmp_path):
     assert ["api.html", "rise_envs.noise.Part"] in targets  # a field is told by what holds it
     assert ["api.html", "module-rise_envs.noise"] in targets
     assert ["reference/security.html"] in targets
-    assert "download" not in html
+    assert "_downloads" not in html
 
 
 def test_links_to_what_is_not_there_are_errors(tmp_path):
