@@ -91,4 +91,4 @@ format: $(STAMP)
 	$(BIN)/python -m ruff format .
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache
+	rm -rf $(VENV) build docs/reference dist *.egg-info .pytest_cache .ruff_cache .mypy_cache

@@ -154,9 +154,11 @@ def environments() -> dict[str, str]:
 
 def env_picture(env_id: str) -> str:
     """An episode of the environment or, of a stand-in that draws nothing, of what it models."""
-    own = picture("envs", env_id, f"An expert in {env_id}; dashed or translucent: the noisy reading")
-    if own or env_id not in STAND_INS:
-        return own
+    own = picture("envs", env_id, f"An expert in {env_id}")
+    if own:
+        return f"{own}\n\n*An expert at noise level 1; dashed, or translucent: the obstacle as it is read.*"
+    if env_id not in STAND_INS:
+        return ""
     modelled = STAND_INS[env_id]
     there = picture("envs", modelled, f"An expert in {modelled}")
     return f"{there}\n\n*Drawn by {modelled}, which it models.*" if there else ""
@@ -243,6 +245,9 @@ def agent(name: str) -> str:
     module = inspect.getmodule(kind)
     said = inspect.getdoc(module) or inspect.getdoc(kind) or ""
     shown = [picture("agents", f"{name}-{env_id}", f"{name} in {env_id}") for env_id in ENVS]
+    if any(shown):
+        words = "of those that it ends safely at its goal: an illustration, no result"
+        shown.append(f"\n*The first validation scenario at noise level 1, {words}.*")
     first = next((env_id for env_id in ENVS if env_id not in STAND_INS), "")
     make = f'```python\nfrom rise_agents import make_agent\n\nagent = make_agent("{name}", "{first}")\n```'
     judged = "its one or mean action" if kind.evaluate_deterministic else "what it draws in every step"

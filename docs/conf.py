@@ -48,8 +48,6 @@ napoleon_use_ivar = True  # an attribute that a class docstring lists is not des
 html_theme = "furo"
 html_title = project
 html_copy_source = html_show_copyright = html_show_sphinx = False
-html_static_path = ["static"]
-html_css_files = ["site.css"]
 
 
 class Links(SphinxTransform):
@@ -180,6 +178,7 @@ def setup(app: Sphinx) -> None:
     """Connect what is above; called by Sphinx."""
     app.connect("builder-inited", lambda app: catalogue.write(Path(app.srcdir) / catalogue.FOLDER))
     app.connect("source-read", only_what_is_there)
+    app.connect("env-get-outdated", lambda *_: ["index"])  # which results come to, and go from
     app.connect("autodoc-process-docstring", without_markdown)
     app.connect("autodoc-process-signature", with_short_arrays)
     app.connect("autodoc-skip-member", without_repetition)

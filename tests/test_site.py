@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import re
+import runpy
 import subprocess
 import sys
 from dataclasses import fields
@@ -135,6 +136,19 @@ def test_pages_are_written_once_and_removed_when_they_are_none(catalogue, tmp_pa
     assert [path.name for path in tmp_path.rglob("*.md")] == ["b.md"]
 
 
+def test_results_are_on_the_site_once_there_are_some(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    prepared = runpy.run_path(str(DOCS / "conf.py"))["only_what_is_there"]
+    prepared.__globals__["HERE"] = tmp_path
+    index = (DOCS / "index.md").read_text()
+    before, after = [index], [index]
+    prepared(None, "index", before)
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results" / "README.md").write_text("# Results\n")
+    prepared(None, "index", after)
+    assert "results/README" not in before[0] and after == [index] and "\nresults/README\n" in index
+
+
 # --- links, on a site of three pages ---------------------------------------------------------------------------
 
 CONF = """
@@ -143,7 +157,7 @@ sys.path.insert(0, {docs!r})
 import catalogue
 catalogue.write = lambda folder: None  # of the pages that are made, none
 globals().update(runpy.run_path({docs!r} + "/conf.py"))
-html_static_path, html_css_files, exclude_patterns = [], [], []
+exclude_patterns = []
 """
 GOOD = """# Site
 
