@@ -96,6 +96,7 @@ def _connected(address: str | None) -> Any:
     """The module ``ray``, connected; its messages are for who looks for its defects."""
     limit_threads()
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # a run tells nobody of itself
+    os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "error")
     import ray
     import ray.util.scheduling_strategies  # which its users find there
 
@@ -110,5 +111,6 @@ def _connected(address: str | None) -> Any:
     except (OSError, RuntimeError, ValueError, AssertionError) as error:
         where = address or os.environ.get("RAY_ADDRESS") or "here"
         lines = (str(error).strip() or type(error).__name__).splitlines()
-        raise ValueError(f"--executor ray: cannot use the cluster at {where}: {lines[0]}") from None
+        hint = "" if "RAY_AUTH_MODE" in os.environ else "; if it asks for a token, set RAY_AUTH_MODE=token"
+        raise ValueError(f"--executor ray: cannot use the cluster at {where}: {lines[0]}{hint}") from None
     return ray

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import secrets
 import shutil
 import signal
 import socket
@@ -29,6 +30,8 @@ ENVIRONMENT = {
     **os.environ,
     "PYTHONPATH": str(ROOT),
     "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_AUTH_MODE": "token",
+    "RAY_AUTH_TOKEN": secrets.token_hex(32),
     "RAY_worker_niceness": "0",  # else a busy machine leaves them nothing
 }
 FAR = 'mount -t tmpfs none "$1" && shift && exec "$@"'  # in a view of the file system of its own
@@ -98,9 +101,9 @@ def listens(port: int) -> bool:
 
 
 def wait_for(true) -> None:
-    until = time.monotonic() + 600
+    until = time.monotonic() + 1200
     while not true():
-        assert time.monotonic() < until
+        assert time.monotonic() < until, "in vain"
         time.sleep(0.1)
 
 
