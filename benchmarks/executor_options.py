@@ -96,7 +96,6 @@ def _connected(address: str | None) -> Any:
     """The module ``ray``, connected; its messages are for who looks for its defects."""
     limit_threads()
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # a run tells nobody of itself
-    os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "error")
     import ray
     import ray.util.scheduling_strategies  # which its users find there
 

@@ -100,14 +100,17 @@ def serve(
     strange = differing(order.suite)
     if strange:
         return {"strange": f"node {platform.node()} has {strange}"}
-    if all(marker.exists() for marker in order.markers) and shipping.all_here(order.inputs):
+    if shipping.all_here({**dict.fromkeys(order.markers, 0), **order.inputs}):
         return _done(order, shipping.rewritten(order.job, shipping.full), _Sender(order.every, tell))
     if files is None:
         return {"unseen": True}
-    with Scratch({path: content() for path, content in files.items()}) as scratch:
-        job = shipping.rewritten(order.job, scratch.place)
-        answer = _done(order, job, _Sender(order.every, tell, scratch.news))
-        return {**answer, "files": scratch.news(), "gone": scratch.gone()}
+    try:
+        with Scratch({path: content() for path, content in files.items()}) as scratch:
+            job = shipping.rewritten(order.job, scratch.place)
+            answer = _done(order, job, _Sender(order.every, tell, scratch.news))
+            return {**answer, "files": scratch.news(), "gone": scratch.gone()}
+    except OSError as error:  # the node's disk is full
+        return _failed(error)
 
 
 def _done(order: Order, job: Job, tell: Callable[..., None]) -> dict[str, Any]:
@@ -115,7 +118,11 @@ def _done(order: Order, job: Job, tell: Callable[..., None]) -> dict[str, Any]:
         _import_modules(order.modules)
         return {"result": order.function(tell, job)}
     except Exception as error:  # whatever it is, the worker lives on
-        return {"error": f"{type(error).__name__}: {error}", "trace": traceback.format_exc()}
+        return _failed(error)
+
+
+def _failed(error: Exception) -> dict[str, Any]:
+    return {"error": f"{type(error).__name__}: {error}", "trace": traceback.format_exc()}
 
 
 class _Sender:

@@ -88,7 +88,7 @@ class Scratch:
     def __init__(self, files: Mapping[Path, Content]) -> None:
         _sweep()
         self.root = Path(tempfile.mkdtemp(prefix=f"{_FOLDER}{os.getpid()}-"))
-        self._inputs = list(files)
+        self._there = set(files)  # what the other machine has
         for path, content in files.items():
             self.place(path).parent.mkdir(parents=True, exist_ok=True)
             content.tofile(self.place(path))
@@ -110,11 +110,12 @@ class Scratch:
         now = self._stamps()
         changed = [path for path, stamp in now.items() if self._sent.get(path) != stamp]
         self._sent = now
+        self._there.update(changed)
         return {path: np.fromfile(self.place(path), np.uint8) for path in changed}
 
     def gone(self) -> list[Path]:
-        """Those of the files that came with the job which it has removed."""
-        return [path for path in self._inputs if not self.place(path).exists()]
+        """Files that came from there or were sent there, and that the job has removed since."""
+        return sorted(path for path in self._there if not self.place(path).exists())
 
     def _stamps(self) -> dict[Path, Stamp]:
         found = {}

@@ -197,9 +197,9 @@ def _learn(output, progress, data, others):
     state.parent.mkdir(parents=True, exist_ok=True)
     state.write_text("x" * (steps + 1))
     progress(0.5, {})
-    if steps < 1:
+    if steps < 1 and output.stem == "0":
         raise SystemExit("killed")
-    (output.parent / "events").mkdir()
+    (output.parent / "events").mkdir(exist_ok=True)
     (output.parent / "events" / "one").write_text("event")
     output.with_suffix(".json").write_text("record")
     output.write_text(f"{text} in {steps + 1} steps")
@@ -231,6 +231,8 @@ def test_files_go_to_a_node_that_sees_none_and_come_back(ran, tmp_path):
     }
     assert made == {"0.rise": "set, agent, its record in 2 steps", "0.json": "record", "events/one": "event"}
     assert len(ray.stored) == 4  # three inputs once each, and the state
+    assert ran(FakeRay(far=True), jobs[1])[0] == {}
+    assert jobs[1].output.exists() and not jobs[1].output.with_suffix(".training").exists()
 
 
 def _collect(output, progress, parts):
@@ -262,6 +264,17 @@ def test_inputs_that_only_this_machine_has_are_sent_though_the_folder_is_seen(ra
 
 def _copy(output, progress, source):
     output.write_text(source.read_text())
+
+
+def test_a_full_disk_of_a_node_is_a_failure_of_the_job(ran, tmp_path, monkeypatch):
+    (tmp_path / "data").write_text("here")
+
+    def full(files):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(ray_pool, "Scratch", full)
+    job = Job("copy", _copy, {"source": tmp_path / "data"}, tmp_path / "copy")
+    assert ran(FakeRay(far=True), job)[0] == {"copy": "OSError: [Errno 28] No space left on device"}
 
 
 def test_folders_of_the_killed_are_swept(tmp_path, monkeypatch):
