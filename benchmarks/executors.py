@@ -5,11 +5,11 @@ Who does the work is a pool: the processes of this machine, or a Ray cluster (:m
 
 from __future__ import annotations
 
+import heapq
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -122,35 +122,48 @@ class _Schedule:
         exists: Callable[[Path], bool],
     ) -> None:
         self.pool, self.pending, self.watch, self.say, self.exists = pool, pending, watch, say, exists
-        self.waiting = dict(enumerate(pending))
-        self.missing = {path for job in pending for path in job.needs if not exists(path)}
         self.deaths = Counter[int]()
         self.failures: list[Failure] = []
+        self.lacking: dict[int, set[Path]] = {}  # of jobs that cannot start yet, what they need
+        self.waited_for = defaultdict[Path, list[int]](list)
+        for number, job in enumerate(pending):
+            for path in dict.fromkeys(job.needs):
+                if not exists(path):
+                    self.lacking.setdefault(number, set()).add(path)
+                    self.waited_for[path].append(number)
+        self.ready = [number for number in range(len(pending)) if number not in self.lacking]  # a heap
 
     def run(self, time_is_up: Callable[[], bool]) -> list[Failure]:
-        while (self.waiting or self.pool.busy) and not time_is_up():
-            ready = (n for n, job in self.waiting.items() if self.missing.isdisjoint(job.needs))
-            for number in list(islice(ready, max(0, self.pool.free))):
-                self.pool.start(number, _work, self.waiting.pop(number))
+        while (self.ready or self.lacking or self.pool.busy) and not time_is_up():
+            for _ in range(min(self.pool.free, len(self.ready))):
+                number = heapq.heappop(self.ready)
+                self.pool.start(number, _work, self.pending[number])
             if not self.pool.busy:  # what is left needs something that failed
-                left = self.waiting.values()
+                left = (self.pending[number] for number in self.lacking)
                 return self.failures + [Failure(job, "a job that it needs failed") for job in left]
             for ended in self.pool.wait():
                 self.note(ended)
         return self.failures
 
+    def made(self, path: Path) -> None:
+        for number in self.waited_for.pop(path, ()):
+            self.lacking[number].remove(path)
+            if not self.lacking[number]:
+                del self.lacking[number]
+                heapq.heappush(self.ready, number)
+
     def note(self, ended: Ended) -> None:
         job, reason = self.pending[ended.key], ended.error
         done = self.exists(job.output)  # whatever became of its process
         if done:
-            self.missing.discard(job.output)
+            self.made(job.output)
         if ended.died and not done:
             self.deaths[ended.key] += 1
             died = f"its worker process ended with {ended.died}"
             if self.deaths[ended.key] < ATTEMPTS:
                 attempt = f"attempt {self.deaths[ended.key] + 1} of {ATTEMPTS}"
                 self.say(f"{job.name}: {died}; {attempt} goes on from what is stored")
-                self.waiting[ended.key] = job
+                heapq.heappush(self.ready, ended.key)
                 return
             memory = " (out of memory?)" if ended.died == "SIGKILL" else ""
             reason = f"{died}{memory}, {ATTEMPTS} times"
