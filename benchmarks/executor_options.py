@@ -8,6 +8,7 @@ import logging
 import os
 import socket
 import sys
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -50,22 +51,43 @@ def check(arguments: argparse.Namespace) -> None:
         raise ValueError("--executor ray gives each job a CPU: leave out --device")
     if importlib.util.find_spec("ray") is None:
         raise ValueError("--executor ray needs one more package: pip install 'rise-suite[ray]'")
-    if arguments.ray_address is not None:
-        _check_address(arguments.ray_address)
+    arguments.ray_address = _checked(arguments.ray_address)
 
 
-def _check_address(address: str) -> None:
-    """Raise ``ValueError`` if nobody listens there; Ray itself would try for minutes."""
-    if address in ("auto", "local"):
-        return
+def _checked(address: str | None) -> str:
+    """An address at which a cluster answers, or ``local``: one is started. Ray itself would try for minutes.
+
+    Raises:
+        ValueError: nobody answers where a cluster is said to be.
+    """
+    source = "--ray-address"
+    if address in (None, "auto") and os.environ.get("RAY_ADDRESS"):
+        source, address = "RAY_ADDRESS", os.environ["RAY_ADDRESS"]
+    if address == "local":
+        return address
+    if address not in (None, "auto"):
+        _check_answers(source, address)
+        return address
+    started = Path(os.environ.get("RAY_TMPDIR") or tempfile.gettempdir(), "ray", "ray_current_cluster")
+    try:
+        _check_answers(str(started), started.read_text().strip())
+    except (OSError, ValueError):  # none was started on this machine, or it has ended
+        if address == "auto":
+            raise ValueError(f"{source} auto: this machine is part of no Ray cluster") from None
+        return "local"
+    return "auto"
+
+
+def _check_answers(source: str, address: str) -> None:
+    """Raise ``ValueError`` unless somebody listens at an address; ``source`` is who gave it."""
     host, _, port = address.rpartition(":")
     if not (host and "/" not in host and port.isascii() and port.isdecimal() and int(port) < 1 << 16):
-        raise ValueError(f"--ray-address takes HOST:PORT, auto or local, got {address[:80]!r}")
+        raise ValueError(f"{source} takes HOST:PORT, auto or local, got {address[:80]!r}")
     try:
         socket.create_connection((host.strip("[]"), int(port)), _PATIENCE).close()
     except (OSError, UnicodeError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise ValueError(f"--ray-address {address}: no answer from there: {reason}") from None
+        raise ValueError(f"{source} {address}: no answer from there: {reason}") from None
 
 
 @contextmanager
@@ -92,7 +114,7 @@ def pool_of(arguments: argparse.Namespace, folders: Sequence[Path]) -> Iterator[
         ray.shutdown()
 
 
-def _connected(address: str | None) -> Any:
+def _connected(address: str) -> Any:
     """The module ``ray``, connected; its messages are for who looks for its defects."""
     limit_threads()
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # a run tells nobody of itself
@@ -108,8 +130,7 @@ def _connected(address: str | None) -> Any:
             runtime_env={"env_vars": {name: os.environ[name] for name in THREADS}},
         )
     except (OSError, RuntimeError, ValueError, AssertionError) as error:
-        where = address or os.environ.get("RAY_ADDRESS") or "here"
         lines = (str(error).strip() or type(error).__name__).splitlines()
         hint = "" if "RAY_AUTH_MODE" in os.environ else "; if it asks for a token, set RAY_AUTH_MODE=token"
-        raise ValueError(f"--executor ray: cannot use the cluster at {where}: {lines[0]}{hint}") from None
+        raise ValueError(f"--executor ray: cannot use the cluster at {address}: {lines[0]}{hint}") from None
     return ray

@@ -384,6 +384,32 @@ def test_an_address_that_does_not_answer_is_named(capsys, tmp_path, monkeypatch)
     assert error.count("\n") == 1 and f"--ray-address {address}: no answer from there" in error
 
 
+def test_where_a_cluster_is_looked_for(tmp_path, monkeypatch):
+    """Where it answers; one that has ended leaves the file in which Ray would find it, and would wait for it."""
+    monkeypatch.setenv("RAY_TMPDIR", str(tmp_path))
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    assert [executor_options._checked(given) for given in (None, "local")] == ["local", "local"]
+    with socket.socket() as listening:
+        listening.bind(("127.0.0.1", 0))
+        listening.listen()
+        address = f"127.0.0.1:{listening.getsockname()[1]}"
+        (tmp_path / "ray").mkdir()
+        (tmp_path / "ray" / "ray_current_cluster").write_text(address)
+        assert [executor_options._checked(given) for given in (None, "auto", address)] == [
+            "auto",
+            "auto",
+            address,
+        ]
+        monkeypatch.setenv("RAY_ADDRESS", address)
+        assert executor_options._checked(None) == address
+    with pytest.raises(ValueError, match=f"^RAY_ADDRESS {address}: no answer"):
+        executor_options._checked(None)
+    monkeypatch.delenv("RAY_ADDRESS")
+    assert executor_options._checked(None) == "local"
+    with pytest.raises(ValueError, match=r"^--ray-address auto: this machine is part of no Ray cluster$"):
+        executor_options._checked("auto")
+
+
 def _arguments(**others):
     return argparse.Namespace(**{"executor": "ray", "ray_address": None, "device": "cpu", **others})
 
