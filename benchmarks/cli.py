@@ -40,6 +40,9 @@ COMMANDS = {
     "runtime-replay": Command("rise_agents.runtime.replay", "show what its log says"),
     "speed": Command("benchmarks.speed.__main__", "measure speed against the peers"),
     "fidelity": Command("benchmarks.fidelity.__main__", "measure the kinematic arm against Bullet's"),
+    "cluster-estimate": Command(
+        "benchmarks.cluster_estimate", "how long a run takes on a cluster, from measured times"
+    ),
     "faults": Command("benchmarks.faults.__main__", "try to break the suite"),
 }
 SHELLS = ("bash", "zsh", "tcsh")

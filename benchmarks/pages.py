@@ -81,6 +81,7 @@ class Block:
 SPEED = Block("speed", "make speed")
 FIDELITY = Block("fidelity", "python -m benchmarks.fidelity")
 FAULTS = Block("faults", "make faults")
+CLUSTER = Block("cluster", "python -m benchmarks.cluster_estimate")
 
 
 def markdown_table(header: Sequence[str], rules: Sequence[str], lines: Sequence[Sequence[str]]) -> str:

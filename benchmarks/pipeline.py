@@ -10,9 +10,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks import published, report, results
+from benchmarks import job_times, published, report, results
 from benchmarks.display import Display
-from benchmarks.executors import Failure, never, run_jobs
+from benchmarks.executors import Failure, MakeCrew, never, run_jobs
 from benchmarks.explorer import trajectory_jobs
 from benchmarks.html_report import write_page
 from benchmarks.jobs import (
@@ -36,6 +36,7 @@ from benchmarks.published import Published
 from benchmarks.sections import sections
 from rise_agents import checkpoint, demonstrations
 from rise_agents.files import sweep
+from rise_agents.pool import Pool
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class How:
     """How a plan is carried out; none of this changes a result, but for the last digits that a device gives.
 
     Attributes:
-        workers: processes.
+        workers: jobs at once, at most; None: one per core of what works.
         device: torch device for training.
         videos: whether to draw clips, and to trace the episodes that the report shows step by step.
         every: seconds between two checkpoints of a training.
@@ -51,9 +52,10 @@ class How:
         tensorboard: folder for event files of the trainings; None: none are written.
         source: published results from which episodes are taken instead of running them.
         time_is_up: whether to interrupt what runs, and to start nothing more.
+        pool: makes what works, see :func:`run_jobs`.
     """
 
-    workers: int
+    workers: int | None
     device: str = "cpu"
     videos: bool = True
     every: float = 15.0
@@ -61,6 +63,7 @@ class How:
     tensorboard: Path | None = None
     source: Published | None = None
     time_is_up: Callable[[], bool] = never
+    pool: MakeCrew = Pool
 
 
 @dataclass(frozen=True)
@@ -101,7 +104,8 @@ def execute(plan: Plan, out: Path, how: How) -> Outcome:
         # All workers stay busy to the end if long jobs start first; rows are whole as soon as can be if they do not.
         limited = how.time_is_up is not never
         turn = with_events(in_turn(jobs, ends) if limited else jobs, how.tensorboard)
-        failures = run_jobs(turn, how.workers, display.watch, display.say, how.time_is_up, not limited)
+        watch = job_times.noting(out / job_times.NAME, display.watch)
+        failures = run_jobs(turn, how.workers, watch, display.say, how.time_is_up, not limited, how.pool)
     # Asked again: pieces of a set of demonstrations are gone, and not needed, as soon as it is put together.
     outcome = Outcome(failures, [job for job in wanted(jobs, ends) if not job.output.exists()])
     _write_failures(out / "failures.log", failures)

@@ -14,9 +14,11 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from benchmarks import executor_options
 from benchmarks.labels import count
 from benchmarks.presets import PRESETS
 from benchmarks.protocol import Plan, make_plan, with_filters
@@ -129,8 +131,9 @@ def parser() -> Parser:
         "--workers",
         type=int,
         metavar="N",
-        help="processes (default: one per core); results do not depend on it",
+        help="jobs at once (default: one per core); results do not depend on it",
     )
+    executor_options.add_options(p)
     p.add_argument("--device", default="cpu", help="torch device that agents train on (default: cpu)")
     p.add_argument(
         "--checkpoint-every",
@@ -191,6 +194,7 @@ def plan_of(arguments: argparse.Namespace) -> Plan:
         raise ValueError("--pretrained trains nobody: leave out --seeds and --demos")
     if arguments.tensorboard is not None:
         prepare_events(arguments.tensorboard)
+    executor_options.check(arguments)
     reported = [env for env in ENVS if env not in STAND_INS]
     plan = make_plan(
         arguments.preset,
@@ -287,6 +291,11 @@ def _told(outcome: Outcome, hours: float | None) -> list[str]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the benchmark; returns the exit code: 0 done, 1 not all was done, 2 bad arguments, 130 interrupted."""
+    with ExitStack() as stack:
+        return _main(argv, stack)
+
+
+def _main(argv: Sequence[str] | None, stack: ExitStack) -> int:
     started = time.perf_counter()
     try:
         arguments = parser().parse_args(argv)
@@ -295,6 +304,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         out = arguments.out or Path("runs") / arguments.preset
         source = _source(arguments.published, out)
         prepare_folder(out)
+        folders = [folder for folder in (out, arguments.tensorboard) if folder is not None]
+        pool = stack.enter_context(executor_options.pool_of(arguments, folders))
     except ValueError as error:
         print(f"benchmarks.run: {error}", file=sys.stderr)
         return 2
@@ -305,10 +316,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         from benchmarks.executors import never
         from benchmarks.pipeline import How, execute
         from rise_agents.files import sole_user
-        from rise_agents.workers import available_cores
 
         how = How(
-            workers=arguments.workers or available_cores(),
+            workers=arguments.workers,
             device=arguments.device,
             videos=not arguments.no_videos,
             every=arguments.checkpoint_every,
@@ -316,6 +326,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             tensorboard=arguments.tensorboard,
             source=source,
             time_is_up=never if arguments.hours is None else time_limit(arguments.hours, started),
+            pool=pool,
         )
         with sole_user(out):
             outcome = execute(plan, out, how)

@@ -24,7 +24,8 @@ except ImportError:  # no POSIX system: temporary files are neither locked nor s
     fcntl = None  # type: ignore[assignment]
 
 StrPath = str | os.PathLike[str]
-_TEMPORARY = re.compile(r"\.partial-[0-9a-f]{16}-([0-9a-f]{8}.*)")
+TEMPORARY = ".partial-"  # what the names of temporary files begin with
+_NAMES = re.compile(re.escape(TEMPORARY) + r"[0-9a-f]{16}-([0-9a-f]{8}.*)")
 
 
 @contextmanager
@@ -62,13 +63,18 @@ def replace_file(path: StrPath, content: bytes) -> Path:
     return Path(path)
 
 
+def temporary_name(path: Path) -> Path:
+    """A new name beside ``path`` for what :func:`sweep` may remove unless it is locked."""
+    return path.with_name(f"{TEMPORARY}{secrets.token_hex(8)}-{_ending(path.name)}")
+
+
 def sweep(folder: StrPath, name: str | None = None) -> None:
     """Remove what writers that were killed left in ``folder`` (of the file ``name``; by default of all)."""
     if fcntl is None:
         return
     own = None if name is None else _ending(name)
-    for stray in Path(folder).glob(".partial-*"):
-        match = _TEMPORARY.fullmatch(stray.name)
+    for stray in Path(folder).glob(f"{TEMPORARY}*"):
+        match = _NAMES.fullmatch(stray.name)
         if match is None or own not in (None, match[1]):
             continue
         try:
@@ -102,7 +108,7 @@ def sole_user(folder: StrPath) -> Iterator[None]:
 def _open_locked(path: Path) -> IO[bytes]:
     # Not tempfile: its files are private to the user, and results are there to be shared.
     while True:
-        file = path.with_name(f".partial-{secrets.token_hex(8)}-{_ending(path.name)}").open("xb")
+        file = temporary_name(path).open("xb")
         if fcntl is None:
             return file
         with suppress(OSError):  # where files cannot be locked, nothing is swept either

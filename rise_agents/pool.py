@@ -19,7 +19,7 @@ from multiprocessing.connection import Connection, wait
 from typing import Any
 
 from rise_agents.plugins import import_modules, imported
-from rise_agents.workers import limit_threads
+from rise_agents.workers import available_cores, limit_threads
 
 # Told the key of a task and whatever it had to tell.
 Listener = Callable[..., None]
@@ -53,11 +53,13 @@ class Ended:
 class Pool:
     """At most ``workers`` freshly started processes (a fork would copy the parent's threads and engines).
 
+    None: as many as there are cores.
+
     A context manager; leaving it ends all workers at once. ``listener`` hears what tasks tell, in :meth:`wait`.
     """
 
-    def __init__(self, workers: int, listener: Listener = lambda key, *told: None) -> None:
-        self.workers, self.listener = workers, listener
+    def __init__(self, workers: int | None, listener: Listener = lambda key, *told: None) -> None:
+        self.workers, self.listener = workers or available_cores(), listener
         self._crew: list[_Worker] = []
 
     def __enter__(self) -> Pool:

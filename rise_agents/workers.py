@@ -6,7 +6,7 @@ import ctypes
 import os
 import sys
 
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+THREADS = ("OMP_NUMTHREADS", "OPENBLAS_NUMTHREADS", "MKL_NUMTHREADS", "NUMBA_NUMTHREADS")
 
 
 def available_cores() -> int:
@@ -19,7 +19,7 @@ def limit_threads() -> None:
 
     Several single-threaded workers beat one worker with several threads on networks of this size.
     """
-    for name in _THREADS:
+    for name in THREADS:
         os.environ.setdefault(name, "1")
 
 

@@ -7,9 +7,11 @@ import sys
 import time
 import warnings
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from benchmarks import executor_options
 from benchmarks.run import parse_settings, prepare_events
 from rise_agents import AGENTS
 from rise_agents.cli import Parser, prepare_folder
@@ -99,7 +101,8 @@ def parser() -> Parser:
         dest="settings",
         help="settings that are not searched but the same in all trials, for instance rise.average=4",
     )
-    p.add_argument("--workers", type=int, metavar="N", help="processes (default: one per core)")
+    p.add_argument("--workers", type=int, metavar="N", help="jobs at once (default: one per core)")
+    executor_options.add_options(p)
     p.add_argument(
         "--checkpoint-every",
         type=float,
@@ -162,11 +165,17 @@ def search_of(a: argparse.Namespace) -> Search:
         settings_file.read(a.write)
     if a.tensorboard is not None:
         prepare_events(a.tensorboard)
+    executor_options.check(a)
     return search
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Search settings; returns the exit code: 0 done, 1 something failed, 2 bad arguments, 130 interrupted."""
+    with ExitStack() as stack:
+        return _main(argv, stack)
+
+
+def _main(argv: Sequence[str] | None, stack: ExitStack) -> int:
     started = time.perf_counter()
     try:
         a = parser().parse_args(argv)
@@ -182,6 +191,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         sets = given_sets(search)
         earlier = read(a.known) if a.known else {}
         prepare_folder(a.out)
+        folders = [folder for folder in (a.out, a.tensorboard) if folder is not None]
+        pool = stack.enter_context(executor_options.pool_of(a, folders))
     except ValueError as error:
         print(f"benchmarks.tune: {error}", file=sys.stderr)
         return 2
@@ -190,11 +201,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     command = ("python", "-m", "benchmarks.tune", *(sys.argv[1:] if argv is None else argv))
     try:
         from rise_agents.files import sole_user
-        from rise_agents.workers import available_cores
 
-        how = How(
-            a.workers or available_cores(), a.checkpoint_every, command, a.write, a.tensorboard, earlier
-        )
+        how = How(a.workers, a.checkpoint_every, command, a.write, a.tensorboard, earlier, pool)
         with sole_user(a.out):
             failures = execute(search, sets, a.out, how)
     except KeyboardInterrupt:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from benchmarks.display import Display
-from benchmarks.executors import Failure, run_jobs
+from benchmarks.executors import Failure, MakeCrew, run_jobs
 from benchmarks.jobs import Job, demonstrations_folder, recording_jobs, tidy, wanted, with_events
 from benchmarks.labels import count
 from benchmarks.plots import save_png
@@ -19,6 +19,7 @@ from benchmarks.tune.ranking import Rates, best_clean, finalists, mean, ranked
 from benchmarks.tune.studies import Study, condition, drawn_trials, judge
 from rise_agents import demonstrations
 from rise_agents.files import sweep
+from rise_agents.pool import Pool
 from rise_envs import STAND_INS
 
 
@@ -78,20 +79,22 @@ class How:
     """How a search is carried out; none of this changes what it finds.
 
     Attributes:
-        workers: processes.
+        workers: jobs at once, at most; None: one per core of what works.
         every: seconds between two checkpoints of a training.
         command: how it was started, for the comments of settings files.
         write: a settings file that the chosen settings go into, beside the one in the folder.
         tensorboard: folder for event files of the trainings; None: none are written.
         known: lines of an earlier search's table, by the name of their result.
+        pool: makes what works, see :func:`run_jobs`.
     """
 
-    workers: int
+    workers: int | None
     every: float
     command: tuple[str, ...]
     write: Path | None = None
     tensorboard: Path | None = None
     known: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    pool: MakeCrew = Pool
 
 
 def given_sets(search: Search) -> dict[str, tuple[Path, str]]:
@@ -225,7 +228,8 @@ def _jobs(trials: Mapping[Study, Iterable[int]], seeds: Iterable[int], out: Path
 def _run(jobs: Sequence[Job], how: How, kinds: str) -> list[Failure]:
     with Display() as display:
         display.plan(jobs, kinds)
-        return run_jobs(with_events(jobs, how.tensorboard), how.workers, display.watch, display.say)
+        turn = with_events(jobs, how.tensorboard)
+        return run_jobs(turn, how.workers, display.watch, display.say, pool=how.pool)
 
 
 def _measured(study: Study, trials: Iterable[int], seeds: Iterable[int], out: Path) -> dict[int, Rates]:

@@ -1,0 +1,184 @@
+"""A Ray cluster of two nodes makes the tables of the local pool: if both see the run folder, or one; if one is lost."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+
+import pytest
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(
+        shutil.which("ray", path=str(Path(sys.executable).parent)) is None, reason="needs Ray"
+    ),
+]
+ROOT = Path(__file__).parents[1]
+RAY = str(Path(sys.executable).parent / "ray")
+SMOKE = ["--preset", "smoke", "--agents", "rise", "pcbc", "cppo", "--envs", "RISE-GroundVehicle-v0"]
+# Tests in the background inherit that Ctrl-C is ignored.
+COMMAND = """
+import runpy, signal
+signal.signal(signal.SIGINT, signal.default_int_handler)
+runpy.run_module("benchmarks.run", run_name="__main__")
+"""
+ENVIRONMENT = {
+    **os.environ,
+    "PYTHONPATH": str(ROOT),
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_AUTH_MODE": "token",
+    "RAY_AUTH_TOKEN": secrets.token_hex(32),
+    "RAY_worker_niceness": "0",  # else a busy machine leaves them nothing
+}
+FAR = 'mount -t tmpfs none "$1" && shift && exec "$@"'  # in a view of the file system of its own
+UNSHARE = shutil.which("unshare") or "unshare"
+
+
+def blinded(command: list[str], folder: Path) -> list[str]:
+    """``command`` such that it sees nothing of a folder."""
+    return [UNSHARE, "-rm", "sh", "-c", FAR, "sh", str(folder), *command]
+
+
+def can_be_blinded() -> bool:
+    with suppress(OSError):
+        return not subprocess.run(blinded(["true"], ROOT), check=False, capture_output=True).returncode
+    return False
+
+
+@contextmanager
+def process(command: list[str], **options) -> Iterator[subprocess.Popen]:
+    """A process and all that it starts, for the time of the block."""
+    with subprocess.Popen(command, env=ENVIRONMENT, start_new_session=True, **options) as started:
+        try:
+            yield started
+        finally:
+            if started.poll() is None:
+                started.terminate()  # Ray ends what it has started
+                with suppress(subprocess.TimeoutExpired):
+                    started.wait(30)
+            kill(started)
+
+
+def kill(started: subprocess.Popen) -> None:
+    with suppress(ProcessLookupError):
+        os.killpg(started.pid, signal.SIGKILL)
+
+
+@contextmanager
+def node(*options: str, blind: Path | None = None) -> Iterator[subprocess.Popen]:
+    """A node of a cluster; it sees nothing of the folder ``blind``."""
+    command = [RAY, "start", "--block", "--disable-usage-stats", *options]
+    seeing = command if blind is None else blinded(command, blind)
+    with process(seeing, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as started:
+        yield started
+
+
+@contextmanager
+def cluster(head: int, second: int, blind: Path | None = None) -> Iterator[tuple[str, subprocess.Popen]]:
+    """The address of a cluster whose two nodes have so many CPUs, and the second one."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    address = f"127.0.0.1:{port}"
+    local = "--node-ip-address=127.0.0.1"
+    with ExitStack() as stack:
+        options = [f"--port={port}", "--include-dashboard=false", f"--num-cpus={head}", local]
+        stack.enter_context(node("--head", *options))
+        wait_for(lambda: listens(port))
+        other = stack.enter_context(node(f"--address={address}", f"--num-cpus={second}", local, blind=blind))
+        yield address, other
+
+
+def listens(port: int) -> bool:
+    with suppress(OSError):
+        socket.create_connection(("127.0.0.1", port), 1).close()
+        return True
+    return False
+
+
+def wait_for(true) -> None:
+    until = time.monotonic() + 1200
+    while not true():
+        assert time.monotonic() < until, "in vain"
+        time.sleep(0.1)
+
+
+def run(out: Path, *options: str) -> subprocess.Popen:
+    return subprocess.Popen(
+        [sys.executable, "-c", COMMAND, *SMOKE, "--checkpoint-every", "0", *options, "--out", str(out)],
+        env=ENVIRONMENT,
+        start_new_session=True,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def on(address: str) -> tuple[str, ...]:
+    return "--executor", "ray", "--ray-address", address, "--workers", "2"
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
+    """What the local pool makes."""
+    out = tmp_path_factory.mktemp("local") / "run"
+    started = run(out)
+    _, error = started.communicate(timeout=1200)
+    assert started.returncode == 0, error
+    return out
+
+
+def check_same(out: Path, made: Path) -> None:
+    """All files are there, those of results byte for byte."""
+    files = [{str(p.relative_to(each)) for p in each.rglob("*") if p.is_file()} for each in (made, out)]
+    assert files[0] == files[1]
+    for name in files[0]:
+        if name.endswith((".parquet", ".csv", ".rise")) and name != "job_times.csv":
+            assert (out / name).read_bytes() == (made / name).read_bytes(), name
+
+
+def test_nodes_that_see_the_run_folder(made, tmp_path):
+    with cluster(1, 1) as (address, _):
+        started = run(tmp_path / "run", *on(address))
+        _, error = started.communicate(timeout=1200)
+    assert started.returncode == 0, error
+    check_same(tmp_path / "run", made)
+
+
+@pytest.mark.skipif(not can_be_blinded(), reason="needs user namespaces")
+def test_a_node_that_does_not_see_the_run_folder(made, tmp_path):
+    """The head has no CPU: everything runs on the other one."""
+    with cluster(0, 2, blind=tmp_path) as (address, _):
+        started = run(tmp_path / "run", *on(address))
+        _, error = started.communicate(timeout=1200)
+    assert started.returncode == 0, error
+    check_same(tmp_path / "run", made)
+
+
+def test_a_node_that_is_lost_and_a_run_that_is_interrupted(made, tmp_path):
+    """Its job goes on on the other node; after Ctrl-C nothing is left, and the local pool does the rest."""
+    out = tmp_path / "run"
+    with cluster(1, 1) as (address, second):
+        started = run(out, *on(address))
+        wait_for(lambda: list(out.glob("agents/*/*.training")))
+        kill(second)
+        wait_for(lambda: list(out.glob("parts/*/*.parquet")))
+        os.killpg(started.pid, signal.SIGINT)
+        _, error = started.communicate(timeout=120)
+    assert started.returncode == 130, error
+    assert "attempt 2 of 3" in error and "Traceback" not in error
+    assert "interrupted; what is finished is kept" in error
+    assert not (out / "episodes.parquet").exists() and not list(out.rglob(".partial-*"))
+    started = run(out)
+    _, error = started.communicate(timeout=1200)
+    assert started.returncode == 0, error
+    check_same(out, made)
