@@ -7,7 +7,6 @@ Every job of the preset gets the time that the most similar ones took in a run t
 from __future__ import annotations
 
 import heapq
-import sys
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from benchmarks.presets import PRESETS
-from rise_agents.cli import Parser
+from rise_agents.cli import Parser, command
 
 if TYPE_CHECKING:
     from benchmarks.jobs import Job
@@ -189,23 +188,18 @@ def estimate(a: Any) -> str:
     return "\n".join([*lines, "", table(costs, a.cores, a.price)])
 
 
+@command("benchmarks.cluster_estimate")
 def main(argv: Sequence[str] | None = None) -> int:
-    """Estimate; returns the exit code: 0 done, 2 bad arguments."""
-    try:
-        a = parser().parse_args(argv)
-        _check(a)
-        from benchmarks.pages import CLUSTER
+    """Estimate; returns the exit code: 0 done, 1 a file cannot be written, 2 bad arguments, 130 interrupted."""
+    a = parser().parse_args(argv)
+    _check(a)
+    from benchmarks.pages import CLUSTER
 
-        if a.docs is not None:
-            CLUSTER.check(a.docs)
-        text = estimate(a)
-        if a.docs is not None:
-            CLUSTER.update(a.docs, text)
-    except ValueError as error:
-        print(f"benchmarks.cluster_estimate: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        return 130
+    if a.docs is not None:
+        CLUSTER.check(a.docs)
+    text = estimate(a)
+    if a.docs is not None:
+        CLUSTER.update(a.docs, text)
     print(text)
     return 0
 

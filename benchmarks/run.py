@@ -14,7 +14,6 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +21,7 @@ from benchmarks import executor_options
 from benchmarks.labels import count
 from benchmarks.presets import PRESETS
 from benchmarks.protocol import Plan, make_plan, with_filters
-from rise_agents.cli import Parser, prepare_folder
+from rise_agents.cli import INTERRUPTED, Parser, at_work, command, prepare_folder
 
 if TYPE_CHECKING:
     from benchmarks.pipeline import Outcome
@@ -289,30 +288,18 @@ def _told(outcome: Outcome, hours: float | None) -> list[str]:
     return lines
 
 
+@command("benchmarks.run", interrupted=INTERRUPTED)
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the benchmark; returns the exit code: 0 done, 1 not all was done, 2 bad arguments, 130 interrupted."""
-    with ExitStack() as stack:
-        return _main(argv, stack)
-
-
-def _main(argv: Sequence[str] | None, stack: ExitStack) -> int:
     started = time.perf_counter()
-    try:
-        arguments = parser().parse_args(argv)
-        warnings.simplefilter("ignore", DeprecationWarning)  # of libraries; their users cannot act on them
-        plan = plan_of(arguments)
-        out = arguments.out or Path("runs") / arguments.preset
-        source = _source(arguments.published, out)
-        prepare_folder(out)
-        folders = [folder for folder in (out, arguments.tensorboard) if folder is not None]
-        pool = stack.enter_context(executor_options.pool_of(arguments, folders))
-    except ValueError as error:
-        print(f"benchmarks.run: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        return 130
-    command = ("python", "-m", "benchmarks.run", *(sys.argv[1:] if argv is None else argv))
-    try:
+    arguments = parser().parse_args(argv)
+    warnings.simplefilter("ignore", DeprecationWarning)  # of libraries; their users cannot act on them
+    plan = plan_of(arguments)
+    out = arguments.out or Path("runs") / arguments.preset
+    source = _source(arguments.published, out)
+    prepare_folder(out)
+    folders = [folder for folder in (out, arguments.tensorboard) if folder is not None]
+    with executor_options.pool_of(arguments, folders) as pool, at_work():
         from benchmarks.executors import never
         from benchmarks.pipeline import How, execute
         from rise_agents.files import sole_user
@@ -322,7 +309,7 @@ def _main(argv: Sequence[str] | None, stack: ExitStack) -> int:
             device=arguments.device,
             videos=not arguments.no_videos,
             every=arguments.checkpoint_every,
-            command=command,
+            command=("python", "-m", "benchmarks.run", *(sys.argv[1:] if argv is None else argv)),
             tensorboard=arguments.tensorboard,
             source=source,
             time_is_up=never if arguments.hours is None else time_limit(arguments.hours, started),
@@ -330,15 +317,6 @@ def _main(argv: Sequence[str] | None, stack: ExitStack) -> int:
         )
         with sole_user(out):
             outcome = execute(plan, out, how)
-    except KeyboardInterrupt:
-        print(
-            "\nbenchmarks.run: interrupted; what is finished is kept, run the command again to go on",
-            file=sys.stderr,
-        )
-        return 130
-    except (OSError, ValueError) as error:
-        print(f"benchmarks.run: {error}", file=sys.stderr)
-        return 1
     lines = _told(outcome, arguments.hours)
     for line in lines:
         print(f"benchmarks.run: {line}", file=sys.stderr)

@@ -65,6 +65,8 @@ def prepare_folder(out: Path) -> None:
         raise ValueError(f"cannot write to the folder {str(out)!r}: {error.strerror}") from None
 
 
+INTERRUPTED = "interrupted; what is finished is kept, run the command again to go on"
+
 Main = Callable[[Sequence[str] | None], int]
 Errors = tuple[type[Exception], ...]
 

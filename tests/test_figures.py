@@ -111,7 +111,7 @@ def test_only_trainings_write(tmp_path):
 
 def test_trainings_of_a_search_write_too(tmp_path, monkeypatch):
     seen = []
-    monkeypatch.setattr(search, "run_jobs", lambda jobs, *rest: seen.extend(jobs) or [])
+    monkeypatch.setattr(search, "run_jobs", lambda jobs, *rest, **how: seen.extend(jobs) or [])
     how = search.How(1, 15.0, (), tensorboard=tmp_path / "events")
     search._run([Job("a", train, {"env": VEHICLE}, tmp_path / "x.rise")], how, "train")
     assert [job.arguments["events"] for job in seen] == [tmp_path / "events" / VEHICLE / "x"]

@@ -267,7 +267,7 @@ def made_up(objective):
     """A stand-in of ``run_jobs`` that trains nobody: the rates of trial settings and seed are ``objective``'s."""
     calls = []
 
-    def run(jobs, workers, watch, say):
+    def run(jobs, workers, watch, say, **how):
         failures = []
         for job in jobs:
             if job.output.exists():

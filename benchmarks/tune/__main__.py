@@ -7,14 +7,13 @@ import sys
 import time
 import warnings
 from collections.abc import Sequence
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from benchmarks import executor_options
 from benchmarks.run import parse_settings, prepare_events
 from rise_agents import AGENTS
-from rise_agents.cli import Parser, prepare_folder
+from rise_agents.cli import INTERRUPTED, Parser, at_work, command, prepare_folder
 
 if TYPE_CHECKING:
     from benchmarks.tune.search import Search
@@ -169,51 +168,27 @@ def search_of(a: argparse.Namespace) -> Search:
     return search
 
 
+@command("benchmarks.tune", interrupted=INTERRUPTED)
 def main(argv: Sequence[str] | None = None) -> int:
     """Search settings; returns the exit code: 0 done, 1 something failed, 2 bad arguments, 130 interrupted."""
-    with ExitStack() as stack:
-        return _main(argv, stack)
-
-
-def _main(argv: Sequence[str] | None, stack: ExitStack) -> int:
     started = time.perf_counter()
-    try:
-        a = parser().parse_args(argv)
-        warnings.simplefilter("ignore", DeprecationWarning)  # of libraries; their users cannot act on them
-        search = search_of(a)
-        from benchmarks.tune.known import read
-        from benchmarks.tune.search import (
-            How,
-            execute,
-            given_sets,
-        )  # only now: it imports all that work needs
+    a = parser().parse_args(argv)
+    warnings.simplefilter("ignore", DeprecationWarning)  # of libraries; their users cannot act on them
+    search = search_of(a)
+    from benchmarks.tune.known import read
+    from benchmarks.tune.search import How, execute, given_sets  # only now: it imports all that work needs
 
-        sets = given_sets(search)
-        earlier = read(a.known) if a.known else {}
-        prepare_folder(a.out)
-        folders = [folder for folder in (a.out, a.tensorboard) if folder is not None]
-        pool = stack.enter_context(executor_options.pool_of(a, folders))
-    except ValueError as error:
-        print(f"benchmarks.tune: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        return 130
-    command = ("python", "-m", "benchmarks.tune", *(sys.argv[1:] if argv is None else argv))
-    try:
+    sets = given_sets(search)
+    earlier = read(a.known) if a.known else {}
+    prepare_folder(a.out)
+    folders = [folder for folder in (a.out, a.tensorboard) if folder is not None]
+    with executor_options.pool_of(a, folders) as pool, at_work():
         from rise_agents.files import sole_user
 
-        how = How(a.workers, a.checkpoint_every, command, a.write, a.tensorboard, earlier, pool)
+        told = ("python", "-m", "benchmarks.tune", *(sys.argv[1:] if argv is None else argv))
+        how = How(a.workers, a.checkpoint_every, told, a.write, a.tensorboard, earlier, pool)
         with sole_user(a.out):
             failures = execute(search, sets, a.out, how)
-    except KeyboardInterrupt:
-        print(
-            "\nbenchmarks.tune: interrupted; what is finished is kept, run the command again to go on",
-            file=sys.stderr,
-        )
-        return 130
-    except (OSError, ValueError) as error:
-        print(f"benchmarks.tune: {error}", file=sys.stderr)
-        return 1
     for failure in failures:
         print(f"benchmarks.tune: failed: {failure.job.name}: {failure.reason}", file=sys.stderr)
     print(f"{'Finished' if not failures else 'Stopped'} after {time.perf_counter() - started:.0f} s: {a.out}")
