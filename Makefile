@@ -6,7 +6,7 @@ STAMP   = $(VENV)/.installed
 ARGS   ?=
 RUN    ?= runs/paper
 
-.PHONY: bench reproduce results tune speed faults faults-quick coverage test test-slow smoke lint audit format clean help
+.PHONY: bench reproduce results tune speed faults faults-quick coverage test test-slow smoke lint docs audit format clean help
 
 help:
 	@echo "make bench      install, then demonstrations, training, 1,000 noisy scenarios, tables, figures, videos"
@@ -21,6 +21,7 @@ help:
 	@echo "make test-slow  the tests that take minutes"
 	@echo "make smoke      the whole benchmark in miniature"
 	@echo "make lint       ruff and mypy"
+	@echo "make docs       the documentation as a site, into build/docs; any warning is an error"
 	@echo "make audit      known vulnerabilities of what is installed (needs pypi.org)"
 	@echo "Extra arguments go through ARGS, for instance: make bench ARGS='--noise-model episode'"
 
@@ -68,6 +69,11 @@ lint: $(STAMP)
 	$(BIN)/python -m ruff check .
 	$(BIN)/python -m ruff format --check .
 	$(BIN)/python -m mypy
+	$(BIN)/python -m mypy docs/conf.py docs/pictures.py
+
+docs: $(STAMP)
+	$(BIN)/python -m sphinx --fail-on-warning --keep-going --nitpicky --quiet --jobs auto docs build/docs $(ARGS)
+	@echo "open build/docs/index.html"
 
 # pip-audit has a venv of its own, so that it changes nothing of what it looks at. --strict: a package that the
 # database does not know is an error, else a machine that cannot reach it would find everything in order.
@@ -85,4 +91,4 @@ format: $(STAMP)
 	$(BIN)/python -m ruff format .
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache
+	rm -rf $(VENV) build docs/reference dist *.egg-info .pytest_cache .ruff_cache .mypy_cache

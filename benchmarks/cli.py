@@ -29,6 +29,7 @@ COMMANDS = {
     "tune": Command("benchmarks.tune.__main__", "search settings, with the same budget for every agent"),
     "report": Command("benchmarks.report", "make tables and figures again, from the episodes of a run"),
     "replay": Command("benchmarks.replay", "run a recorded episode again, check it, draw it"),
+    "upload": Command("benchmarks.upload", "show a run on Weights & Biases"),
     "publish": Command("benchmarks.publish", "make what is committed of a run, or check it"),
     "demonstrations": Command("rise_agents.demonstrations.__main__", "record an expert's episodes"),
     "play": Command("rise_agents.play", "drive with the keyboard, keep it as demonstrations"),

@@ -165,7 +165,7 @@ def _trainings(
                 record = folder / Path(path).with_suffix(".json")
                 if split_row(row)[0] == base and path not in seen and record.is_file():
                     seen.add(path)
-                    curves[f"seed {seed}"] = _curve(record)
+                    curves[f"seed {seed}"] = curve(record)
             chart = charts.training(
                 f"{agent_label(base)} on {env_label(env)}", curves, plots.colour(list(bases), base)
             )
@@ -173,7 +173,7 @@ def _trainings(
     return found
 
 
-def _curve(path: Path) -> list[dict[str, float]]:
+def curve(path: Path) -> list[dict[str, float]]:
     """The figures of progress of one training; raises ``ValueError`` if it is no such record."""
     try:
         return [

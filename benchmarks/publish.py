@@ -11,7 +11,7 @@ from typing import Any
 
 from benchmarks import report, results
 from benchmarks.results_page import PAGE, check_page, renew_page, stale
-from rise_agents.cli import Parser, prepare_folder
+from rise_agents.cli import Parser, command, prepare_folder
 from rise_agents.files import sole_user
 
 DEFAULT_OUT = Path("docs") / "results"
@@ -153,25 +153,19 @@ def parser() -> Parser:
     return p
 
 
+@command("benchmarks.publish")
 def main(argv: Sequence[str] | None = None) -> int:
     """Publish or check; returns the exit code: 0 done, 1 not as the episodes say or not written, 2 bad input."""
-    try:
-        arguments = parser().parse_args(argv)
-        run, out = arguments.run, arguments.out
-        if arguments.check:
-            return _check(run)
-        if not run.is_dir():
-            raise ValueError(f"{str(run)!r} is not a folder")
-        if run.resolve() == out.resolve():
-            raise ValueError(f"--out is the run folder itself, {str(run)!r}: name another folder")
-        with sole_user(run):
-            publish(run, out, arguments.partial)
-    except (ValueError, OSError) as error:
-        print(f"benchmarks.publish: {error}", file=sys.stderr)
-        return 2 if isinstance(error, ValueError) else 1
-    except KeyboardInterrupt:
-        print("\nbenchmarks.publish: interrupted", file=sys.stderr)
-        return 130
+    arguments = parser().parse_args(argv)
+    run, out = arguments.run, arguments.out
+    if arguments.check:
+        return _check(run)
+    if not run.is_dir():
+        raise ValueError(f"{str(run)!r} is not a folder")
+    if run.resolve() == out.resolve():
+        raise ValueError(f"--out is the run folder itself, {str(run)!r}: name another folder")
+    with sole_user(run):
+        publish(run, out, arguments.partial)
     print(f"Written: {out / PAGE} and what it is made from")
     return 0
 

@@ -7,7 +7,6 @@ checkpoints of a run folder name. It is run anew, and must come out as it is sto
 from __future__ import annotations
 
 import io
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ from benchmarks.labels import TRUE, agent_label, condition_label, env_label, nam
 from benchmarks.recorded import Row, Run, open_run
 from benchmarks.report import read_run
 from benchmarks.trajectories import Trajectory, repeating
-from rise_agents.cli import Parser
+from rise_agents.cli import Parser, command
 from rise_envs.task import task_of
 
 _SUFFIXES = (".mp4", ".png")
@@ -183,35 +182,25 @@ def _the_row(run: Run, arguments: Any) -> Row:
     return run.find(**key, scenario=arguments.scenario)
 
 
+@command("benchmarks.replay", bad_input=(gymnasium.error.Error,))  # an environment that is not there
 def main(argv: Sequence[str] | None = None) -> int:
     """Replay or list; returns the exit code: 0 done, 1 a file cannot be written, 2 bad arguments or input, 130."""
-    try:
-        arguments = parser().parse_args(argv)
-        for file in arguments.out:
-            if file.suffix not in _SUFFIXES:
-                raise ValueError(f"--out {str(file)!r} must end in {' or '.join(_SUFFIXES)}")
-        if arguments.limit < 1:
-            raise ValueError(f"--limit must be at least 1, got {arguments.limit}")
-        run = open_run(arguments.run)
-        name_rows(read_run(arguments.run).get("labels", {}))
-        if arguments.list:
-            return _list(run, arguments)
-        row = _the_row(run, arguments)
-        trajectory = run.recreate(row)
-        print(told(row, trajectory, run.rounded))
-        if arguments.out:
-            draw(row, trajectory, arguments.out)
-            print(f"Written: {', '.join(map(str, arguments.out))}")
-    except (
-        ValueError,
-        OSError,
-        gymnasium.error.Error,
-    ) as error:  # the last: an environment that is not there
-        print(f"benchmarks.replay: {error}", file=sys.stderr)
-        return 1 if isinstance(error, OSError) else 2
-    except KeyboardInterrupt:
-        print("\nbenchmarks.replay: interrupted", file=sys.stderr)
-        return 130
+    arguments = parser().parse_args(argv)
+    for file in arguments.out:
+        if file.suffix not in _SUFFIXES:
+            raise ValueError(f"--out {str(file)!r} must end in {' or '.join(_SUFFIXES)}")
+    if arguments.limit < 1:
+        raise ValueError(f"--limit must be at least 1, got {arguments.limit}")
+    run = open_run(arguments.run)
+    name_rows(read_run(arguments.run).get("labels", {}))
+    if arguments.list:
+        return _list(run, arguments)
+    row = _the_row(run, arguments)
+    trajectory = run.recreate(row)
+    print(told(row, trajectory, run.rounded))
+    if arguments.out:
+        draw(row, trajectory, arguments.out)
+        print(f"Written: {', '.join(map(str, arguments.out))}")
     return 0
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import re
-import sys
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from pathlib import Path
@@ -35,7 +34,7 @@ from benchmarks.labels import (
 from benchmarks.results import atomic_write_text, read_rows
 from benchmarks.sections import Section, compared, sections
 from benchmarks.tables import ComparisonRow, SummaryRow, analyse, headline_level, write_table
-from rise_agents.cli import Parser, prepare_folder
+from rise_agents.cli import Parser, command, prepare_folder
 from rise_agents.files import sole_user
 
 EPISODES, RECORD = "episodes.parquet", "run.json"  # what a report is made from, in a run folder
@@ -365,6 +364,7 @@ def read_run(folder: Path) -> dict[str, Any]:
             "rows": [str(name) for name in record.get("rows", record["plan"]["agents"])],
             "training": dict(record.get("training", {})),
             "labels": {name: str(each["label"]) for name, each in variants if each["label"]},
+            "variants": {name: str(each["agent"]) for name, each in variants},
             "unfinished": int(record.get("unfinished", 0)),
             "blocks": [_block(each) for each in record.get("blocks", ())],
             "agents": {env: dict(paths) for env, paths in dict(record.get("agents", {})).items()},
@@ -401,26 +401,20 @@ def parser() -> Parser:
     return p
 
 
+@command("benchmarks.report")
 def main(argv: Sequence[str] | None = None) -> int:
     """Make a report; returns the exit code: 0 done, 1 a file cannot be written, 2 bad arguments or input."""
-    try:
-        arguments = parser().parse_args(argv)
-        source: Path = arguments.source
-        episodes = source / EPISODES if source.is_dir() else source
-        rows, run = read_rows(episodes), read_run(episodes.parent)
-        out: Path = arguments.out or episodes.parent
-        prepare_folder(out)
-        with sole_user(out) if (out / RECORD).exists() else nullcontext():  # a run may be at work there
-            summary = publish(rows, run, out)
-            from benchmarks.html_report import write_page  # it stands on this file
+    arguments = parser().parse_args(argv)
+    source: Path = arguments.source
+    episodes = source / EPISODES if source.is_dir() else source
+    rows, run = read_rows(episodes), read_run(episodes.parent)
+    out: Path = arguments.out or episodes.parent
+    prepare_folder(out)
+    with sole_user(out) if (out / RECORD).exists() else nullcontext():  # a run may be at work there
+        summary = publish(rows, run, out)
+        from benchmarks.html_report import write_page  # it stands on this file
 
-            write_page(summary, run, episodes.parent, out)
-    except (ValueError, OSError) as error:
-        print(f"benchmarks.report: {error}", file=sys.stderr)
-        return 2 if isinstance(error, ValueError) else 1
-    except KeyboardInterrupt:
-        print("\nbenchmarks.report: interrupted", file=sys.stderr)
-        return 130
+        write_page(summary, run, episodes.parent, out)
     asked, *_ = sections(summary, run.get("blocks", ()))
     for env in dict.fromkeys(row.env for row in asked.rows):
         print(summary_table_text(asked.rows, env))

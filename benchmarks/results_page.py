@@ -13,10 +13,13 @@ from benchmarks.results import atomic_write_text, read_rows
 from benchmarks.sections import Section, compared, sections
 from benchmarks.tables import ComparisonRow, SummaryRow, analyse, headline_level, read_table
 from benchmarks.targets import acceptance
+from rise_agents import AGENTS, agent_class
+from rise_agents.agent import config_to_dict, make_config
 
 PAGE = "README.md"
 SUMMARY, COMPARISONS = "summary.csv", "comparisons.csv"
-BLOCKS = {name: Block(name, "make results") for name in ("run", "claims", "acceptance", "controls", "tables")}
+_TOLD = ("run", "settings", "claims", "acceptance", "controls", "tables")
+BLOCKS = {name: Block(name, "make results") for name in _TOLD}
 _SKELETON = """\
 # Results
 
@@ -35,6 +38,10 @@ this folder. Without running anything, from the episodes that are here:
 python -m benchmarks.report docs/results --out tables   # the same CSV files, byte for byte
 python -m benchmarks.publish docs/results --check       # whether tables and page are those of the episodes
 ```
+
+## Settings
+
+{settings}
 
 ## What the figures say
 
@@ -88,6 +95,7 @@ def contents(folder: Path) -> dict[str, str]:
     asked, *others = sections(summary, run.get("blocks", ()))
     return {
         "run": what_was_run(asked.rows, run),
+        "settings": settings_tables(asked.rows, run),
         "claims": "\n\n".join(claims(asked.rows)),
         "acceptance": acceptance(summary, comparisons),
         "controls": control_tables(others) or "Nothing else was measured.",
@@ -126,6 +134,41 @@ def what_was_run(summary: Sequence[SummaryRow], run: Mapping[str, Any]) -> str:
         amount = f"{count([len({row.agent for row in rows})], 'row')}, {sample(rows, 'row')} and condition"
         lines.append(f"- **{env_label(env)}**: {amount}; noise {models}, levels {levels}")
     return "\n".join(lines)
+
+
+def settings_tables(summary: Sequence[SummaryRow], run: Mapping[str, Any]) -> str:
+    """Markdown: a table per task of what each agent learned from, and in which settings it is not as its defaults."""
+    blocks = []
+    for env in dict.fromkeys(row.env for row in summary):
+        names = dict.fromkeys(row.agent for row in summary if row.env == env)
+        trained = {name: run.get("training", {}).get(name, {}).get(env) for name in names}
+        lines = [
+            [
+                agent_label(name),
+                entry.get("learned from", "–"),
+                _chosen(run["variants"].get(name, name), env, entry),
+            ]
+            for name, entry in trained.items()
+            if entry
+        ]
+        if lines:
+            header = ("Agent", "Learned from", "Settings other than its defaults")
+            blocks += [f"{env_label(env)}:", markdown_table(header, ["---"] * 3, lines)]
+    return "\n\n".join(blocks) or "No agent was trained."
+
+
+def _chosen(agent: str, env: str, entry: Mapping[str, Any]) -> str:
+    """Those of an entry of ``training`` in ``run.json``; settings that this version does not know count, too."""
+    defaults = config_to_dict(make_config(agent_class(agent), env, {})) if agent in AGENTS else {}
+    facts = ("learned from", "training time")
+    chosen = {k: v for k, v in entry.items() if k not in facts and (k not in defaults or defaults[k] != v)}
+    return ", ".join(f"`{name}` {_value(value)}" for name, value in chosen.items()) or "none"
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, list | tuple):
+        return " × ".join(map(_value, value))
+    return f"{value:,}" if isinstance(value, int) and not isinstance(value, bool) else str(value)
 
 
 def compact_tables(summary: Sequence[SummaryRow]) -> str:

@@ -17,7 +17,7 @@ from rise_envs.streams import checked_seed
 
 __version__ = "0.1.0"
 
-# name -> "module:Class". A new agent is one file and one line here.
+#: From name to module and class. A new agent is one file and one line here.
 AGENTS: dict[str, str] = {
     "rise": "rise_agents.rise:Rise",
     "pcbc": "rise_agents.pcbc:PCBC",

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import argparse
 import secrets
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import wraps
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -59,3 +63,54 @@ def prepare_folder(out: Path) -> None:
         replace_file(out / f"writable-{secrets.token_hex(4)}", b"").unlink()
     except OSError as error:
         raise ValueError(f"cannot write to the folder {str(out)!r}: {error.strerror}") from None
+
+
+Main = Callable[[Sequence[str] | None], int]
+Errors = tuple[type[Exception], ...]
+
+
+class WorkFailed(Exception):
+    """The arguments were good, and the work failed all the same."""
+
+
+@contextmanager
+def at_work(*errors: type[Exception]) -> Iterator[None]:
+    """From here on it is not the arguments that are wrong: ``ValueError`` and ``errors`` become :class:`WorkFailed`."""
+    kinds: Errors = (ValueError, *errors)
+    try:
+        yield
+    except kinds as error:
+        raise WorkFailed(str(error)) from error
+
+
+def command(
+    name: str, bad_input: Errors = (), failed: Errors = (), interrupted: str = "interrupted"
+) -> Callable[[Main], Callable[..., int]]:
+    """A decorator of ``main``: what a user can cause ends in one line that begins with ``name``, and an exit code.
+
+    Args:
+        name: of the command.
+        bad_input: what else than ``ValueError`` is answered with 2.
+        failed: what else than ``OSError`` and :class:`WorkFailed` is answered with 1.
+        interrupted: what an interruption is answered with, beside 130.
+    """
+    broken: Errors = (OSError, WorkFailed, *failed)
+    bad: Errors = (ValueError, *bad_input)
+    codes: dict[type, int] = {**dict.fromkeys(broken, 1), **dict.fromkeys(bad, 2)}
+    kinds = (*bad, *broken)
+
+    def decorate(main: Main) -> Callable[..., int]:
+        @wraps(main)
+        def ending(argv: Sequence[str] | None = None) -> int:
+            try:
+                return main(argv)
+            except KeyboardInterrupt:
+                print(f"\n{name}: {interrupted}", file=sys.stderr)
+                return 130
+            except kinds as error:
+                print(f"{name}: {error}", file=sys.stderr)
+                return next(codes[kind] for kind in type(error).__mro__ if kind in codes)
+
+        return ending
+
+    return decorate

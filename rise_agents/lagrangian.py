@@ -1,7 +1,7 @@
 """PPO under a cost limit, with a Lagrange multiplier that a PID controller sets.
 
 Stooke, Achiam and Abbeel, "Responsive safety in reinforcement learning by PID Lagrangian methods", ICML 2020:
-with J the mean cost of an episode and d its limit, after every roll-out
+with J the mean cost of an episode and d its limit, after every roll-out ::
 
     Δ = J − d,   I ← (I + K_I Δ)₊,   ∂ = (J − J_before)₊,   λ = (K_P Δ + I + K_D ∂)₊
 

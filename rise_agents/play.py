@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 from rise_agents import demonstrations
 from rise_agents.agent import nearest
 from rise_agents.checkpoint import versions
-from rise_agents.cli import Parser, prepare_folder
+from rise_agents.cli import Parser, at_work, command, prepare_folder
 from rise_agents.demonstrations import DATA, Demonstrations
 from rise_agents.demonstrations.dataset import OBSERVATIONS, check, params_of
 from rise_agents.files import sole_user
@@ -316,6 +315,7 @@ def play(a: argparse.Namespace, kept: list[Drive], tried: int) -> list[Drive]:
     return kept
 
 
+@command("rise_agents.play")
 def main(argv: Sequence[str] | None = None) -> int:
     """Drive; returns the exit code: 0 done, 1 no window can be opened, 2 bad arguments, 130 interrupted."""
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
@@ -324,20 +324,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         a = checked(argv)
         kept, tried = there_already(a)
-    except (ValueError, OSError) as error:
-        print(f"rise_agents.play: {error}", file=sys.stderr)
-        return 2
-    try:
+    except OSError as error:  # of a file that the arguments name
+        raise ValueError(str(error)) from None
+    with at_work(pygame.error):
         if a.out is None:
             play(a, kept, tried)
         else:
             with sole_user(a.out):
                 kept = play(a, kept, tried)
-    except KeyboardInterrupt:
-        return 130
-    except (ValueError, OSError, pygame.error) as error:
-        print(f"rise_agents.play: {error}", file=sys.stderr)
-        return 1
     if a.out is not None:
         print(f"{len(kept)} good episodes in {a.out}" if kept else "no good episode: nothing was written")
     return 0

@@ -95,7 +95,7 @@ class Resume:
             raise CheckpointError(self.path, reason, "remove it to begin anew") from None
 
     def noting(self, progress: Progress) -> Progress:
-        """``progress`` whose figures also go to :attr:`curve`."""
+        """``progress`` whose figures also go to ``curve``."""
 
         def tell(share: float, figures: dict[str, float]) -> None:
             self.curve.append({"share": share, **figures})

@@ -1,11 +1,11 @@
 """RISE: Robust Imitation through Stochastic Encoding (Tayal, Tayal and Prakash), Algorithm 1.
 
-Stage 1 trains a variational autoencoder on the readings c with the negative ELBO
+Stage 1 trains a variational autoencoder on the readings c with the negative ELBO ::
 
     L = −log p_ψ(c | z) + β KL[q_φ(z | c) ‖ N(0, I)],   z = μ + σ ⊙ ε,   ε ~ N(0, I),
 
 where p_ψ is a Gaussian whose deviation is the sensor's noise at level 1: reconstruction errors count in units
-of the reading noise. Stage 2 freezes it and clones the expert's action a with a policy π_θ(s, g, z),
+of the reading noise. Stage 2 freezes it and clones the expert's action a with a policy π_θ(s, g, z) ::
 
     L_π = 1/M Σ_m ℓ(π_θ(s, g, z⁽ᵐ⁾), a),   z⁽ᵐ⁾ = μ + σ ⊙ ε⁽ᵐ⁾,
 
@@ -168,6 +168,7 @@ class Rise:
         return robot + c.latent, c.hidden, cloning.output_size(self.units.size, c.loss)
 
     def _fit_vae(self, vae: VAE, lesson: Lesson, ratio: Tensor, progress: Progress) -> None:
+        """Stage 1 (lines 1 to 10): the autoencoder learns the readings of the demonstrations."""
         from rise_agents.training import fit  # which imports torch
 
         c, seen = self.config, lesson.data.reading
@@ -191,6 +192,7 @@ class Rise:
     def _fit_policy(
         self, policy: nn.Module, lesson: Lesson, posterior: tuple[Tensor, Tensor], progress: Progress
     ) -> None:
+        """Stage 2 (lines 12 to 25): the policy learns their actions, on samples of the posterior."""
         from rise_agents.networks import policy_loss  # which imports torch
         from rise_agents.training import fit
 

@@ -33,7 +33,7 @@ __all__ = [
     "register_noise",
 ]
 
-# id -> (entry point, vector entry point, steps per episode). A new environment is one file and one line here.
+#: id -> (entry point, vector entry point, steps per episode). A new environment is one file and one line here.
 ENVS: dict[str, tuple[str, str | None, int]] = {
     "RISE-GroundVehicle-v0": (
         "rise_envs.ground_vehicle:GroundVehicleEnv",
@@ -48,7 +48,7 @@ ENVS: dict[str, tuple[str, str | None, int]] = {
     ),
 }
 
-# id -> the environment that it models. To train on; results are reported from the one that is modelled.
+#: id -> the environment that it models. To train on; results are reported from the one that is modelled.
 STAND_INS = {"RISE-SafePandaKinematic-v0": "RISE-SafePanda-v0"}
 
 

@@ -84,7 +84,7 @@ class GroundVehicleVectorEnv(VehicleTask, VectorEnv):
 
     @property
     def world(self) -> World:
-        """The true state: to be read, never to be written into.
+        """The true state, to be read, never to be written into.
 
         Raises:
             gymnasium.error.ResetNeeded: before the first reset.

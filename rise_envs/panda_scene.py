@@ -77,7 +77,7 @@ class Params:
 
     @property
     def dt(self) -> float:
-        """Duration of a control step (s): panda-gym's 20 substeps of 2 ms."""
+        """Duration of a control step (s), panda-gym's 20 substeps of 2 ms."""
         return 0.04
 
     @property

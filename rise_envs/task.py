@@ -75,7 +75,7 @@ class Task:
 
     @cached_property
     def noise_channels(self) -> dict[str, tuple[int, ...]]:
-        """Which numbers of a reading are positions, velocities and radii: what noise can be limited to."""
+        """Which numbers of a reading are positions, velocities and radii, which noise can be limited to."""
         parts = self.split(np.arange(self.widths["obstacle"], dtype=np.float64)[None])
         return {
             name: tuple(part.astype(int).ravel().tolist())

@@ -90,7 +90,7 @@ def clipped(x: Number, low: float, high: float) -> Number:
 
 
 def drive(pose: Pose, v: Number, omega: Number, t: Number) -> Pose:
-    """The unicycle's pose (x, y, θ) after driving a constant (v, ω) for ``t`` seconds, exactly; |ωt| ≤ 1."""
+    """The unicycle's pose (x, y, θ) after driving a constant (v, ω) for ``t`` seconds, exactly; −1 ≤ ωt ≤ 1."""
     x, y, theta = pose
     sin, cos = sincos(theta)
     ahead, aside = arc(omega * t)

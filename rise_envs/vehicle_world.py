@@ -20,7 +20,28 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Params:
-    """Every constant of the task, in SI units."""
+    """Every constant of the task, in SI units.
+
+    Attributes:
+        dt: duration of a step (s).
+        v_min: least linear velocity (m/s).
+        v_max: greatest linear velocity (m/s).
+        omega_max: greatest angular velocity either way (rad/s).
+        robot_radius: of the vehicle (m).
+        goal_radius: distance between vehicle and goal that counts as reached (m).
+        arena_half: start and goal lie in the square [−arena_half, arena_half]² (m).
+        goal_distance: range of the distance between start and goal (m).
+        heading_spread: start heading off the goal's direction, at most (rad).
+        obstacle_radius: range of a disc's radius (m).
+        obstacle_speed: greatest speed of a disc (m/s).
+        redraw_interval: mean time between two draws of a disc's velocity (s).
+        obstacle_along: where a disc starts, a range of shares of the way from start to goal.
+        obstacle_offset: to either side of the straight way, at most (m).
+        obstacle_half: centres stay in the square [−obstacle_half, obstacle_half]² (m).
+        goal_gap: discs keep this far off the goal point (m): the whole goal region stays free.
+        start_margin: least clearance over the discs' path in the first ``start_horizon`` seconds (m).
+        start_horizon: of that clearance (s).
+    """
 
     dt: float = 0.1
     v_min: float = 0.0
@@ -28,17 +49,17 @@ class Params:
     omega_max: float = 1.5
     robot_radius: float = 0.5
     goal_radius: float = 0.75
-    arena_half: float = 10.0  # start and goal lie in the square [−arena_half, arena_half]²
+    arena_half: float = 10.0
     goal_distance: tuple[float, float] = (12.5, 20.0)
-    heading_spread: float = np.pi / 3  # start heading off the goal's direction, at most
+    heading_spread: float = np.pi / 3
     obstacle_radius: tuple[float, float] = (0.75, 2.0)
     obstacle_speed: float = 1.0
-    redraw_interval: float = 2.0  # mean time between two draws of a disc's velocity
-    obstacle_along: tuple[float, float] = (0.35, 0.75)  # share of the way from start to goal
-    obstacle_offset: float = 2.5  # to either side of the straight way, at most
-    obstacle_half: float = 12.0  # centres stay in the square [−obstacle_half, obstacle_half]²
-    goal_gap: float = 1.5  # discs keep this far off the goal point: the whole goal region stays free
-    start_margin: float = 1.0  # least clearance over the discs' path in the first start_horizon seconds
+    redraw_interval: float = 2.0
+    obstacle_along: tuple[float, float] = (0.35, 0.75)
+    obstacle_offset: float = 2.5
+    obstacle_half: float = 12.0
+    goal_gap: float = 1.5
+    start_margin: float = 1.0
     start_horizon: float = 1.0
 
     def __post_init__(self) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks import cli
+from rise_agents.cli import WorkFailed, at_work, command
 from rise_envs import ENVS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -46,8 +47,8 @@ def test_commands_are_handed_what_follows(name, monkeypatch):
 def test_help_lists_all_commands(capsys):
     assert cli.main(["--help"]) == 0
     text = capsys.readouterr().out
-    for name, command in cli.COMMANDS.items():
-        assert f"  {name} " in text and command.line in text
+    for name, each in cli.COMMANDS.items():
+        assert f"  {name} " in text and each.line in text
     assert "examples:" in text
     assert max(map(len, text.splitlines())) <= 120
     assert cli.main([]) == 2
@@ -150,3 +151,49 @@ def test_a_command_of_the_door_can_be_repeated_from_its_record(tmp_path):
     assert cli.main([*argv, "--workers", "1", "--out", str(out)]) == 0
     command = json.loads((out / "run.json").read_text())["command"]
     assert command.startswith("python -m benchmarks.run --agents random --envs RISE-GroundVehicle-v0")
+
+
+# --- how commands end ----------------------------------------------------------------------------------------------
+
+
+class Narrow(OSError):
+    """A kind of its own of what else is a failure."""
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "says"),
+    [
+        (ValueError("no such thing"), 2, "tool: no such thing\n"),
+        (UnicodeError("not text"), 2, "tool: not text\n"),  # a ValueError, too
+        (PermissionError("not yours"), 1, "tool: not yours\n"),
+        (Narrow("of the arguments"), 2, "tool: of the arguments\n"),
+        (KeyError("key"), 1, "tool: 'key'\n"),
+        (WorkFailed("broke"), 1, "tool: broke\n"),
+        (KeyboardInterrupt(), 130, "\ntool: stopped\n"),
+    ],
+)
+def test_a_command_ends_in_one_line_and_a_code(error, code, says, capsys):
+    @command("tool", bad_input=(Narrow,), failed=(KeyError,), interrupted="stopped")
+    def main(argv=None):
+        raise error
+
+    assert main([]) == code
+    assert capsys.readouterr().err == says
+
+
+def test_what_no_user_can_cause_is_not_hidden():
+    @command("tool")
+    def main(argv=None):
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        main([])
+
+
+def test_at_work_the_arguments_are_not_to_blame():
+    with pytest.raises(WorkFailed, match="damaged"), at_work():
+        raise ValueError("damaged")
+    with pytest.raises(WorkFailed), at_work(KeyError):
+        raise KeyError("key")
+    with pytest.raises(KeyError), at_work():
+        raise KeyError("key")

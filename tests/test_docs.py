@@ -7,6 +7,7 @@ import importlib
 import inspect
 import re
 import runpy
+import shlex
 from dataclasses import fields
 from functools import reduce
 from pathlib import Path
@@ -19,7 +20,7 @@ from benchmarks.configs import SHIPPED, read
 from benchmarks.presets import PRESETS
 from benchmarks.replay import parser as replay_parser
 from benchmarks.results import SCHEMA
-from benchmarks.run import parser
+from benchmarks.run import parser, plan_of
 from benchmarks.speed.page import BLOCK
 from benchmarks.speed.rows import ROWS
 from benchmarks.tables import ComparisonRow, SummaryRow
@@ -38,7 +39,10 @@ from rise_envs.task import env_class, task_of
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 TASKS = [env_id for env_id in ENVS if env_id not in STAND_INS]  # what is benchmarked
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
+MADE = DOCS / "reference"  # by the build of the site
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
+PAGES += [page for page in sorted(DOCS.rglob("*.md")) if MADE not in page.parents]
+TUTORIALS = [DOCS / "quickstart.md", *sorted((DOCS / "tutorials").glob("*.md"))]  # commands are run, too
 PICTURES = {DOCS / "images" / "vehicle.png", DOCS / "images" / "panda.png"}  # drawn from a finished run
 PACKAGES = ("rise_envs", "rise_agents", "benchmarks")
 
@@ -104,20 +108,59 @@ def member(file: Path, name: str) -> Any:
 # --- snippets, links, doctests ---------------------------------------------------------------------------------
 
 
+def script(page: Path, folder: Path) -> str:
+    """What a reader of a page would run, at the lines of the page, so that tracebacks name them.
+
+    Python as it stands; blocks that are marked ``file=NAME`` are saved in ``folder``; of the commands in tutorials
+    those that say where their output goes.
+    """
+    lines, inside, saved, command = [], "", None, ""
+    for line in page.read_text().splitlines():
+        fence = re.fullmatch(r"```(\w*)(?: file=(\S+))?", line)
+        if inside:
+            if fence:
+                inside, saved = "", None
+            elif saved:
+                saved.write_text(saved.read_text() + line + "\n")
+        elif fence:
+            inside = fence[1] or "text"
+            saved = folder / fence[2] if fence[2] else None
+            if saved:
+                saved.write_text("")
+        runs = inside == "python" and not fence and not saved
+        lines.append(line if runs else "")
+        if inside == "sh" and page in TUTORIALS:
+            command += line.removesuffix("\\")
+            if line.endswith("\\"):
+                continue
+            if command.startswith("rise-bench") and "--out" in command:
+                lines[-1] = f"assert not __import__('benchmarks.cli').cli.main({shlex.split(command)[1:]})"
+            command = ""
+    return "\n".join(lines)
+
+
 @pytest.mark.parametrize("page", [p for p in PAGES if "```python" in p.read_text()], ids=page_id)
 def test_snippets_run(page, tmp_path, monkeypatch, own_names):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "docs").symlink_to(DOCS)  # paths on the pages are those of the repository
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
-    # The page with everything but its snippets blanked: a traceback then names the line of the page.
-    lines, inside = [], False
-    for line in page.read_text().splitlines():
-        inside = inside and line != "```"
-        lines.append(line if inside else "")
-        inside = inside or line == "```python"
-    script = tmp_path / f"{page.stem}.py"
-    script.write_text("\n".join(lines))
-    runpy.run_path(str(script))
+    path = tmp_path / f"{page.stem}_page.py"
+    path.write_text(script(page, tmp_path))
+    runpy.run_path(str(path))
+
+
+def tutorial_commands() -> list[str]:
+    """All commands of the benchmark that tutorials name, whether or not they are run."""
+    text = "\n".join(page.read_text() for page in TUTORIALS).replace("\\\n", " ")
+    return [line for line in text.splitlines() if line.startswith("rise-bench run")]
+
+
+@pytest.mark.parametrize("command", tutorial_commands())
+def test_commands_of_tutorials_are_accepted(command, monkeypatch, tmp_path, own_names):
+    monkeypatch.chdir(tmp_path)
+    if "linear.py" in command:
+        script(DOCS / "tutorials" / "agent.md", tmp_path)  # saves the file
+    plan_of(parser().parse_args(shlex.split(command)[2:]))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=page_id)
@@ -274,30 +317,36 @@ def test_the_table_of_frames_has_the_sizes_of_their_inputs():
 
 
 def paper_map() -> list[list[str]]:
-    """Rows of the paper-to-code map, cells as written."""
-    (found,) = [rows for head, rows in tables(DOCS / "agents.md") if head == ["paper", "file", "what"]]
-    return found
+    """Rows of all tables of the paper-to-code map, cells as written."""
+    found = tables(DOCS / "paper.md")
+    return [row for head, rows in found if head == ["paper", "function", "file"] for row in rows]
 
 
 @pytest.mark.parametrize("row", paper_map(), ids=lambda row: plain(row[0]))
 def test_what_the_paper_to_code_map_names_exists(row):
-    ((words, target),) = _LINK.findall(row[1])
-    file = (DOCS / target).resolve()
-    assert words == file.name
-    names = _CODE.findall(row[2])
-    assert names
-    for name in names:
-        assert member(file, name) is not None
+    links = _LINK.findall(row[1])
+    assert links
+    for words, target in links:
+        file = (DOCS / target).resolve()
+        assert file.relative_to(ROOT).as_posix() == plain(row[2])
+        assert member(file, words.strip("`")) is not None
 
 
 def test_the_map_holds_every_equation_and_every_line_of_algorithm_1():
-    lines: set[int] = set()
+    lines: list[int] = []
     for row in paper_map():
         if found := re.match(r"lines? (\d+)(?:–(\d+))?,", row[0]):
-            lines |= set(range(int(found[1]), int(found[2] or found[1]) + 1))
-    assert lines == set(range(1, 27))
+            lines += range(int(found[1]), int(found[2] or found[1]) + 1)
+    assert lines == list(range(1, 27))
     equations = {int(n) for row in paper_map() for n in re.findall(r"^equation (\d)", row[0])}
     assert equations == {1, 2, 3}
+
+
+def test_the_map_holds_every_setting_of_rise_and_its_metrics():
+    named = {words.strip("`") for row in paper_map() for words, _ in _LINK.findall(row[1])}
+    ours = {"average", "posterior"}  # what the paper does not have
+    assert {f"Config.{name}" for name in vars(RiseConfig)["__annotations__"] if name not in ours} <= named
+    assert {"safety_rate", "reach_rate", "StepNoise", "Scenarios", "Mixture"} <= named
 
 
 # --- benchmark -------------------------------------------------------------------------------------------------

@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,9 @@ import pytest
 from hand_made import make_rows
 
 from benchmarks import publish, report, results, results_page
-from benchmarks.tables import ComparisonRow, read_table
+from benchmarks.tables import ComparisonRow, read_table, summarise
+from rise_agents import make_agent
+from rise_agents.agent import config_to_dict
 from rise_agents.files import sole_user
 
 PUBLISHED = Path(__file__).parents[1] / "docs" / "results"
@@ -31,7 +34,9 @@ RECORD = {
     "python": "3.11.9",
     "rows": ["rise", "pcbc"],
     "settings": {"rise@x": {"beta": 0.1, "unit": "m/s"}},
-    "training": {"rise": {ENVS[0]: {"training time": "12 s"}}},
+    "training": {
+        "rise": {ENVS[0]: {"learned from": "24 mixture episodes", "training time": "12 s", "beta": 0.07}}
+    },
     "versions": {"numpy": "2.0.0"},
 }
 
@@ -429,3 +434,23 @@ def test_the_command_explains_itself():
     command = [sys.executable, "-m", "benchmarks.publish", "--help"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert "examples:" in done.stdout and "--out DIR" in done.stdout and "docs/results" in done.stdout
+
+
+# --- settings ------------------------------------------------------------------------------------------------------
+
+
+def test_settings_are_told_where_they_are_not_the_defaults():
+    defaults = config_to_dict(make_agent("rise", ENVS[1]).config)
+    entry = {"learned from": "24 episodes", "training time": "9 s"}
+    training = {
+        "rise": {ENVS[1]: {**entry, **defaults, "hidden": [256, 64], "updates": 40_000, "beta": 0.5}},
+        "large": {ENVS[1]: {**entry, **defaults}},
+        "foreign": {ENVS[1]: {**entry, "gain": 1.5}},
+    }
+    row = summarise(episodes())[0]
+    rows = [replace(row, env=ENVS[1], agent=name) for name in ("rise", "large", "foreign", "expert")]
+    text = results_page.settings_tables(rows, {"training": training, "variants": {"large": "rise"}})
+    assert "| RISE | 24 episodes | `hidden` 256 × 64, `updates` 40,000, `beta` 0.5 |" in text
+    assert "| large | 24 episodes | none |" in text and "| foreign | 24 episodes | `gain` 1.5 |" in text
+    assert "9 s" not in text and "xpert" not in text
+    assert results_page.settings_tables(rows, {"variants": {}}) == "No agent was trained."

@@ -9,13 +9,16 @@ import shutil
 import tomllib
 from pathlib import Path
 
+import imageio.v3 as imageio
 import numpy as np
 import pytest
 from scipy import stats
 
 from benchmarks.executors import Failure
+from benchmarks.plots import colour
 from benchmarks.tune import report, search, settings_file
 from benchmarks.tune.__main__ import main, parser, search_of
+from benchmarks.tune.figure import figure
 from benchmarks.tune.ranking import Rates, best_clean, finalists, mean, ranked, shown_loss
 from benchmarks.tune.studies import drawn_trials
 from rise_agents import AGENTS, agent_class, load_agent, make_agent
@@ -27,6 +30,25 @@ from rise_agents.seeds import SPLITS
 from rise_envs import ENVS, STAND_INS
 
 VEHICLE, PANDA, MODEL = "RISE-GroundVehicle-v0", "RISE-SafePanda-v0", "RISE-SafePandaKinematic-v0"
+
+
+# --- the figure ------------------------------------------------------------------------------------------------
+
+
+def test_the_figure_has_a_mark_per_setting_and_a_ring_around_the_chosen_one():
+    good, noisy, poor = Rates(0.99, 0.97, 0.8, 0.7), Rates(0.98, 0.98, 0.9, 0.9), Rates(0.5, 0.5, 0.5, 0.5)
+    marks = {("rise", VEHICLE): {0: (good, 1), 4: (noisy, 3), 5: (poor, 1)}, ("pcbc", PANDA): {1: (good, 1)}}
+    best = {VEHICLE: good, PANDA: good}
+    drawn = figure(marks, {("rise", VEHICLE): 4}, 0.01, best)
+    vehicle, panda = drawn.axes
+    places = [line.get_xydata()[0].tolist() for line in vehicle.lines if line.get_marker() == "o"]
+    assert places == [[98.0, 75.0], [98.0, 90.0], [98.0, 90.0]]  # the last one is the ring
+    assert [line.get_markerfacecolor() for line in vehicle.lines[:2]] == ["white", colour(["rise"], "rise")]
+    assert vehicle.lines[-1].get_xdata()[0] == pytest.approx(97.0)
+    assert [text.get_text() for text in vehicle.texts] == ["← 1 further left"] and not panda.texts
+    assert [line.get_marker() for line in panda.lines] == ["o", "None"]
+    with pytest.raises(ValueError, match="no settings"):
+        figure({("rise", VEHICLE): {}}, {}, 0.01, best)
 
 
 # --- the rule --------------------------------------------------------------------------------------------------
@@ -295,6 +317,7 @@ def test_the_best_mean_over_the_seeds_is_chosen_from_the_finalists(tmp_path, mon
     assert [(line["trial"], line["train_seed"]) for line in lines if line["trial"] in "36"] == [
         (trial, seed) for trial in "36" for seed in "012"
     ]
+    assert imageio.imread(tmp_path / "search.png").shape[1] > 500
     assert len(lines) == 7 + 2 * 2 and all(json.loads(line["settings"]) in trials for line in lines)
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rise_agents.agent import nearest
-from rise_agents.cli import Parser, prepare_folder
+from rise_agents.cli import Parser, command, prepare_folder
 from rise_agents.workers import available_cores
 
 if TYPE_CHECKING:
@@ -152,31 +152,25 @@ def render(out: Path, docs: Path | None, names: Sequence[str]) -> bool:
     return all(result.met != "no" for result in results if result.name in names)
 
 
+@command("benchmarks.faults")
 def main(argv: Sequence[str] | None = None) -> int:
     """Try and report; returns the exit code: 0 all met, 1 some not met, 2 bad arguments, 130 interrupted."""
     started = time.perf_counter()
-    try:
-        arguments = parser().parse_args(argv)
-        share, names = share_of(arguments), chosen(arguments)
-        prepare_folder(arguments.out)
-        warnings.simplefilter("ignore", DeprecationWarning)  # of libraries; their users cannot act on them
-        if not arguments.render:
-            from rise_agents.workers import limit_threads
+    arguments = parser().parse_args(argv)
+    share, names = share_of(arguments), chosen(arguments)
+    prepare_folder(arguments.out)
+    warnings.simplefilter("ignore", DeprecationWarning)  # of libraries; their users cannot act on them
+    if not arguments.render:
+        from rise_agents.workers import limit_threads
 
-            limit_threads()
-            tried = try_all(names, share, arguments)
-        if arguments.only is not None:
-            from benchmarks.faults.page import table_text
+        limit_threads()
+        tried = try_all(names, share, arguments)
+    if arguments.only is not None:
+        from benchmarks.faults.page import table_text
 
-            print(table_text(tried))
-            return 0 if all(result.met != "no" for result in tried) else 1
-        met = render(arguments.out, arguments.docs, names)
-    except ValueError as error:
-        print(f"benchmarks.faults: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("\nbenchmarks.faults: interrupted", file=sys.stderr)
-        return 130
+        print(table_text(tried))
+        return 0 if all(result.met != "no" for result in tried) else 1
+    met = render(arguments.out, arguments.docs, names)
     print(f"Finished after {time.perf_counter() - started:.0f} s: {arguments.out}")
     return 0 if met else 1
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 import warnings
 from collections.abc import Sequence
@@ -10,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from rise_agents.cli import Parser, prepare_folder
+from rise_agents.cli import Parser, command, prepare_folder
 
 _EXAMPLES = """\
 examples:
@@ -86,44 +85,38 @@ def measure_all(episodes: int, quick: bool) -> tuple[list[Any], dict[str, Any]]:
     return rows, paths
 
 
+@command("benchmarks.fidelity")
 def main(argv: Sequence[str] | None = None) -> int:
     """Measure and write; returns the exit code: 0 done, 2 bad arguments, 130 interrupted.
 
     A target that is not met is no failure of the command.
     """
     started = time.perf_counter()
-    try:
-        arguments = parser().parse_args(argv)
-        if arguments.episodes < 3:
-            raise ValueError(f"--episodes must be at least 3, got {arguments.episodes}")
-        if arguments.docs:
-            from benchmarks.pages import FIDELITY
+    arguments = parser().parse_args(argv)
+    if arguments.episodes < 3:
+        raise ValueError(f"--episodes must be at least 3, got {arguments.episodes}")
+    if arguments.docs:
+        from benchmarks.pages import FIDELITY
 
-            FIDELITY.check(arguments.docs)
-        out: Path = arguments.out
-        prepare_folder(out)
-        warnings.simplefilter("ignore", DeprecationWarning)  # of libraries; their users cannot act on them
-        from benchmarks import plots
-        from benchmarks.fidelity import page
-        from benchmarks.results import atomic_write_text
-        from rise_agents.workers import limit_threads
+        FIDELITY.check(arguments.docs)
+    out: Path = arguments.out
+    prepare_folder(out)
+    warnings.simplefilter("ignore", DeprecationWarning)  # of libraries; their users cannot act on them
+    from benchmarks import plots
+    from benchmarks.fidelity import page
+    from benchmarks.results import atomic_write_text
+    from rise_agents.workers import limit_threads
 
-        limit_threads()
-        rows, paths = measure_all(3 if arguments.quick else arguments.episodes, arguments.quick)
-        page.write_csv(out / "fidelity.csv", rows)
-        drawn = page.figure(paths)
-        plots.save_png(drawn, out / "fidelity.png")
-        text = page.markdown(rows, "fidelity.png")
-        atomic_write_text(out / "fidelity.md", text + "\n")
-        if arguments.docs:
-            plots.save_png(drawn, arguments.docs.parent / "images" / "fidelity.png")
-            page.BLOCK.update(arguments.docs, page.markdown(rows, "images/fidelity.png"))
-    except ValueError as error:
-        print(f"benchmarks.fidelity: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("\nbenchmarks.fidelity: interrupted", file=sys.stderr)
-        return 130
+    limit_threads()
+    rows, paths = measure_all(3 if arguments.quick else arguments.episodes, arguments.quick)
+    page.write_csv(out / "fidelity.csv", rows)
+    drawn = page.figure(paths)
+    plots.save_png(drawn, out / "fidelity.png")
+    text = page.markdown(rows, "fidelity.png")
+    atomic_write_text(out / "fidelity.md", text + "\n")
+    if arguments.docs:
+        plots.save_png(drawn, arguments.docs.parent / "images" / "fidelity.png")
+        page.BLOCK.update(arguments.docs, page.markdown(rows, "images/fidelity.png"))
     print(text)
     for row in rows:
         if not row.met:

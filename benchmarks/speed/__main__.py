@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from rise_agents.agent import nearest
-from rise_agents.cli import Parser, prepare_folder
+from rise_agents.cli import Parser, command, prepare_folder
 
 THROUGHPUT = "throughput"  # the figure, named among the rows
 _EXAMPLES = """\
@@ -133,28 +133,22 @@ def render(out: Path, docs: Path | None) -> None:
     print(page.table_text(results))
 
 
+@command("benchmarks.speed")
 def main(argv: Sequence[str] | None = None) -> int:
     """Measure and report; returns the exit code: 0 done, 1 a row failed, 2 bad arguments, 130 interrupted.
 
     A target that is not met is no failure of the command.
     """
     started = time.perf_counter()
-    try:
-        arguments: Any = parser().parse_args(argv)
-        names = chosen(arguments)
-        prepare_folder(arguments.out)
-        warnings.simplefilter("ignore", DeprecationWarning)  # of libraries; their users cannot act on them
-        from rise_agents.workers import limit_threads
+    arguments: Any = parser().parse_args(argv)
+    names = chosen(arguments)
+    prepare_folder(arguments.out)
+    warnings.simplefilter("ignore", DeprecationWarning)  # of libraries; their users cannot act on them
+    from rise_agents.workers import limit_threads
 
-        limit_threads()
-        wrong = [] if arguments.render else measure_all(names, arguments, arguments.out)
-        render(arguments.out, arguments.docs)
-    except ValueError as error:
-        print(f"benchmarks.speed: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("\nbenchmarks.speed: interrupted", file=sys.stderr)
-        return 130
+    limit_threads()
+    wrong = [] if arguments.render else measure_all(names, arguments, arguments.out)
+    render(arguments.out, arguments.docs)
     for line in wrong:
         print(f"benchmarks.speed: failed: {line}", file=sys.stderr)
     print(f"Finished after {time.perf_counter() - started:.0f} s: {arguments.out}")

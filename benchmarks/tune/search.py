@@ -11,8 +11,10 @@ from benchmarks.display import Display
 from benchmarks.executors import Failure, MakeCrew, run_jobs
 from benchmarks.jobs import Job, demonstrations_folder, recording_jobs, tidy, wanted, with_events
 from benchmarks.labels import count
+from benchmarks.plots import save_png
 from benchmarks.protocol import Plan, imitates
 from benchmarks.tune import known, report
+from benchmarks.tune.figure import Marks, figure
 from benchmarks.tune.ranking import Rates, best_clean, finalists, mean, ranked
 from benchmarks.tune.studies import Study, condition, drawn_trials, judge
 from rise_agents import demonstrations
@@ -163,11 +165,25 @@ def execute(search: Search, sets: Mapping[str, tuple[Path, str]], out: Path, how
             numbers = (chosen, final[chosen], rates[study].get(0), trials, len(seeds), len(rates[study]))
             found.append(report.Found(study, *numbers))
     report.write_trials(out / "trials.csv", studies, len(seeds), out)
+    if best:
+        winners = {(each.study.agent, each.study.env): each.chosen for each in found}
+        save_png(figure(_marks(studies, seeds, out), winners, search.clean_loss, best), out / "search.png")
     tables = report.tables(found, how.command, search.clean_loss)
     for path in [out / "tuned.toml", *([how.write] if how.write else [])]:
         report.write_settings(path, tables)
     print("\n".join(tables.values()))
     return failures
+
+
+def _marks(studies: Sequence[Study], seeds: Sequence[int], out: Path) -> Marks:
+    """All that was measured, for the figure."""
+    marks: dict[tuple[str, str], dict[int, tuple[Rates, int]]] = {}
+    for study in studies:
+        for trial in range(len(study.trials)):
+            measured = [rates for seed in seeds if (rates := study.rates(trial, seed, out))]
+            if measured:
+                marks.setdefault((study.agent, study.env), {})[trial] = mean(measured), len(measured)
+    return marks
 
 
 def _best(rates: Mapping[Study, Mapping[int, Rates]]) -> dict[str, Rates]:

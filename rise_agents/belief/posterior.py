@@ -1,7 +1,7 @@
 """From evidence to a belief: a Gaussian over the true reading, whose mean weighs estimates that are right on average.
 
 A network sees the evidence of :mod:`.history` and answers, for positions, velocities and radius, with weights of the
-estimates at hand (the reading itself, and those of each memory), a correction and a deviation:
+estimates at hand (the reading itself, and those of each memory), a correction and a deviation::
 
     μ = Σ_j w_j ĉ_j + κ ⊙ σ,   w = softmax(·),   |κ| ≤ 5.
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import shutil
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from rise_agents import demonstrations
 from rise_agents.agent import nearest
-from rise_agents.cli import Parser, prepare_folder
+from rise_agents.cli import Parser, at_work, command, prepare_folder
 from rise_agents.demonstrations.minari_io import check_id, export
 from rise_agents.demonstrations.recording import chunk_size
 from rise_agents.experts import expert_names
@@ -85,45 +84,39 @@ def recorded(a: argparse.Namespace) -> demonstrations.Demonstrations:
     return made
 
 
+@command(
+    "rise_agents.demonstrations",
+    interrupted="interrupted; what is recorded is kept, run the command again to go on",
+)
 def main(argv: Sequence[str] | None = None) -> int:
     """Record demonstrations; returns the exit code: 0 done, 1 failed, 2 bad arguments, 130 interrupted."""
     console = Console(stderr=True)
     try:
         a = checked(argv)
-    except (ValueError, OSError) as error:  # OSError: of a path that no system takes
-        print(f"rise_agents.demonstrations: {error}", file=sys.stderr)
-        return 2
+    except OSError as error:  # of a path that no system takes
+        raise ValueError(str(error)) from None
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    bars = Progress(*columns, console=console, disable=not console.is_terminal)
     pieces = a.out / ".parts" / f"{a.expert}-seed{a.seed}-{chunk_size(a.episodes)}"
-    try:
-        with sole_user(a.out), Progress(*columns, console=console, disable=not console.is_terminal) as bars:
-            sweep(a.out)
-            if (a.out / demonstrations.DATA).exists():  # the export is what is missing
-                made = recorded(a)
-            else:
-                bar = bars.add_task(f"{a.expert} on {a.env}", total=a.episodes)
-                made = demonstrations.generate(
-                    a.env,
-                    a.expert,
-                    a.episodes,
-                    a.seed,
-                    a.workers or available_cores(),
-                    finished=lambda kept, tried: bars.update(bar, completed=kept),
-                    parts=pieces,
-                )
-                made.save(a.out)
-            shutil.rmtree(a.out / ".parts", ignore_errors=True)
-            if a.minari is not None:
-                export(made, a.minari)
-    except KeyboardInterrupt:
-        print(
-            "\nrise_agents.demonstrations: interrupted; what is recorded is kept, run the command again to go on",
-            file=sys.stderr,
-        )
-        return 130
-    except (ValueError, OSError, TaskError) as error:
-        print(f"rise_agents.demonstrations: {error}", file=sys.stderr)
-        return 1
+    with at_work(TaskError), sole_user(a.out), bars:
+        sweep(a.out)
+        if (a.out / demonstrations.DATA).exists():  # the export is what is missing
+            made = recorded(a)
+        else:
+            bar = bars.add_task(f"{a.expert} on {a.env}", total=a.episodes)
+            made = demonstrations.generate(
+                a.env,
+                a.expert,
+                a.episodes,
+                a.seed,
+                a.workers or available_cores(),
+                finished=lambda kept, tried: bars.update(bar, completed=kept),
+                parts=pieces,
+            )
+            made.save(a.out)
+        shutil.rmtree(a.out / ".parts", ignore_errors=True)
+        if a.minari is not None:
+            export(made, a.minari)
     card = made.card
     print(
         f"{card['episodes']:,} episodes, {card['transitions']:,} transitions in {a.out}; "

@@ -1,15 +1,15 @@
 """``cbf`` expert of the ground vehicle: a control-barrier-function filter on a look-ahead point.
 
-The point p = q + l·(cos θ, sin θ), l metres ahead of the vehicle's centre q, moves with
+The point p = q + l·(cos θ, sin θ), l metres ahead of the vehicle's centre q, moves with ::
 
     ṗ = v·e + l·ω·e⊥,       e = (cos θ, sin θ),  e⊥ = (−sin θ, cos θ),
 
 so it can be driven in any direction, which the centre cannot. A disc of radius (vehicle radius + l) about p
-covers the vehicle. So for each moving disc (o, v_o, r) the distance
+covers the vehicle. So for each moving disc (o, v_o, r) the distance ::
 
     h = |p − o| − r − (vehicle radius + l) − margin
 
-is a control barrier function, whose condition ḣ ≥ −γ·h is linear in the action:
+is a control barrier function, whose condition ḣ ≥ −γ·h is linear in the action::
 
     n·(v·e + l·ω·e⊥) ≥ n·v_o − γ·h,       n = (p − o) / |p − o|.
 
@@ -51,7 +51,7 @@ class Config:
         turn_gain: nominal ω per radian of heading error (1/s).
         slowest: least nominal speed while turning, as a share of the greatest.
         turn_weight: price of a changed ω (rad/s) against a changed v (m/s).
-        omega_max: bound of |ω| (rad/s).
+        omega_max: bound of ω either way (rad/s).
         guidance: the field that the nominal action follows.
     """
 

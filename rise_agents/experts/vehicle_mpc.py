@@ -1,6 +1,6 @@
 """``mpc`` expert of the ground vehicle: nonlinear model-predictive control, solved at every step.
 
-Over K steps, with the exact unicycle arc as its model and the discs o_k predicted at constant velocity:
+Over K steps, with the exact unicycle arc as its model and the discs o_k predicted at constant velocity::
 
     minimise   Σ |q_k − q̂_k|² + w·ω_k² + λ·(s_k + s_k²)
     subject to x_{k+1} = arc(x_k, v_k, ω_k),  actions inside their bounds,  s_k ≥ 0,

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from rise_agents import load_agent
 from rise_agents.checkpoint import CheckpointError
-from rise_agents.cli import Parser
+from rise_agents.cli import Parser, at_work, command
 
 _EXAMPLES = """\
 examples:
@@ -51,31 +50,21 @@ def settings_of(texts: Sequence[str]) -> dict[str, Any]:
     return found
 
 
+@command("rise_agents.export", bad_input=(CheckpointError,))
 def main(argv: Sequence[str] | None = None) -> int:
     """Export; returns the exit code: 0 done, 1 not written, 2 bad arguments, 130 interrupted."""
-    try:
-        a: Any = parser().parse_args(argv)
-        if not a.onnx:
-            raise ValueError("name the format: --onnx")
-        agent: Any = load_agent(a.agent, a.env, settings=settings_of(a.set))
-        out = a.out or _beside(a.agent, agent.env_id)
-    except (ValueError, CheckpointError) as error:
-        print(f"rise_agents.export: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        return 130
-    try:
-        from rise_agents.export import export
+    a: Any = parser().parse_args(argv)
+    if not a.onnx:
+        raise ValueError("name the format: --onnx")
+    agent: Any = load_agent(a.agent, a.env, settings=settings_of(a.set))
+    out = a.out or _beside(a.agent, agent.env_id)
+    with at_work(ImportError):
+        try:
+            from rise_agents.export import export
 
-        found = export(agent, out)
-    except ModuleNotFoundError as error:
-        print(f"rise_agents.export: {error.name} is missing: pip install 'rise-suite[onnx]'", file=sys.stderr)
-        return 1
-    except (ImportError, OSError, ValueError) as error:
-        print(f"rise_agents.export: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        return 130
+            found = export(agent, out)
+        except ModuleNotFoundError as error:
+            raise ImportError(f"{error.name} is missing: pip install 'rise-suite[onnx]'") from None
     print(f"{out}: {agent.name} for {agent.env_id}, {out.stat().st_size:,} bytes")
     print(f"largest difference over {found.count:,} observations of noisy validation episodes, by action:")
     for name in ("agent", "deterministic", "torch"):

@@ -37,7 +37,7 @@ class Graph:
         self._initializers: list[Any] = []
 
     def input(self, name: str, shape: Sequence[int], dtype: DTypeLike = np.float64) -> Traced:
-        """A new input (batch, *shape)."""
+        """A new input, (batch, …) with the given shape."""
         self.inputs[name] = np.random.default_rng(0).uniform(0.1, 1.0, (BATCH, *shape)).astype(dtype)
         return Traced(self, name, self.inputs[name])
 

@@ -12,7 +12,7 @@ from rise_agents.agent import nearest
 from rise_envs.registry import Entry, check_new, checked_entry, checked_name, find_class
 from rise_envs.task import task_of
 
-# name -> "module:Class".
+#: From name to module and class.
 FILTERS: dict[str, str] = {"kalman": "rise_agents.filters.kalman:KalmanFilter"}
 
 

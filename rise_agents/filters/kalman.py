@@ -1,6 +1,6 @@
 """A Kalman filter (Kalman, 1960) between noisy readings and a policy.
 
-Every coordinate of every ball is a state (p, v), of which each reading measures both:
+Every coordinate of every ball is a state (p, v), of which each reading measures both::
 
     p' = p + dt v,   v' = (1 − q) v + w,   w ~ (0, (1 − (1 − q)²) s²),   q = dt / redraw_interval.
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from typing import Any
 from rise_agents import agent_class, checkpoint, load_agent
 from rise_agents.agent import acting_settings, nearest
 from rise_agents.checkpoint import CheckpointError
-from rise_agents.cli import Parser, prepare_folder
+from rise_agents.cli import Parser, command, prepare_folder
 from rise_agents.files import replace_file
 from rise_agents.pretrained import CARD, FOLDER, file_of, is_name, sha256
 from rise_envs import ENVS
@@ -154,16 +153,10 @@ def ship(a: argparse.Namespace) -> list[Path]:
     return made
 
 
+@command("rise_agents.pretrained", failed=(CheckpointError,))
 def main(argv: Sequence[str] | None = None) -> int:
     """Ship trained agents; returns the exit code: 0 done, 1 a file cannot be read or written, 2 bad arguments."""
-    try:
-        made = ship(parser().parse_args(argv))
-    except ValueError as error:
-        print(f"rise_agents.pretrained: {error}", file=sys.stderr)
-        return 2
-    except (CheckpointError, OSError) as error:
-        print(f"rise_agents.pretrained: {error}", file=sys.stderr)
-        return 1
+    made = ship(parser().parse_args(argv))
     for path in made:
         print(f"{path}: {path.stat().st_size:,} bytes")
     return 0

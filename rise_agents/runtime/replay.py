@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from rise_agents.checkpoint import CheckpointError
-from rise_agents.cli import Parser
+from rise_agents.cli import Parser, command
 from rise_agents.runtime import log
 from rise_agents.runtime.loop import Mind
 from rise_agents.runtime.policies import load_policy
@@ -55,10 +54,11 @@ def decide_again(found: log.Log, policy: Any) -> float:
     return largest
 
 
+@command("rise_agents.runtime.replay", bad_input=(CheckpointError, ImportError))
 def main(argv: Sequence[str] | None = None) -> int:
     """Replay; returns the exit code: 0 done, 2 bad arguments or files, 130 interrupted."""
+    a: Any = parser().parse_args(argv)
     try:
-        a: Any = parser().parse_args(argv)
         found = log.read(a.log)
         print(f"{a.log}: {found.about.get('agent')} in {found.about.get('env')}")
         print(text(summarise(found)))
@@ -69,13 +69,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             difference = decide_again(found, load_policy(a.agent, str(found.about["env"])))
             print(f"decided again by {a.agent}: actions differ by {difference:.1e} at most")
     except (KeyError, TypeError) as error:
-        print(f"rise_agents.runtime.replay: {a.log}: says not enough of its run ({error})", file=sys.stderr)
-        return 2
-    except (ValueError, CheckpointError, ImportError) as error:
-        print(f"rise_agents.runtime.replay: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        return 130
+        raise ValueError(f"{a.log}: says not enough of its run ({error})") from None
     return 0
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import secrets
 import socket
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rise_agents.agent import nearest
-from rise_agents.cli import Parser
+from rise_agents.cli import Parser, WorkFailed, command
 from rise_agents.runtime import log
 from rise_agents.runtime.loop import Clock, Monotonic
 from rise_agents.runtime.udp import Packet, address, pack
@@ -115,29 +114,21 @@ def _source(a: Any) -> Source:
     return VirtualObstacle(a.env, checked_seed(a.seed))
 
 
+@command("rise_agents.runtime.send")
 def main(argv: Sequence[str] | None = None) -> int:
     """Send; returns the exit code: 0 done, 1 the network failed, 2 bad arguments, 130 interrupted."""
-    try:
-        a: Any = parser().parse_args(argv)
-        finite("--rate", a.rate, 1e-3, 1e4)
-        finite("--seconds", a.seconds, 0.0)
-        to = address(a.to)
-        whole("the port of --to", to[1], 1)
-        source = _source(a)
-    except ValueError as error:
-        print(f"rise_agents.runtime.send: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        return 130
+    a: Any = parser().parse_args(argv)
+    finite("--rate", a.rate, 1e-3, 1e4)
+    finite("--seconds", a.seconds, 0.0)
+    to = address(a.to)
+    whole("the port of --to", to[1], 1)
+    source = _source(a)
     family = socket.AF_INET6 if ":" in to[0] else socket.AF_INET
     try:
         with socket.socket(family, socket.SOCK_DGRAM) as out:
             count = send(source, lambda data: _to(out, data, to), a.rate, a.seconds)
     except OSError as error:
-        print(f"rise_agents.runtime.send: cannot send to {a.to}: {error.strerror}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        return 130
+        raise WorkFailed(f"cannot send to {a.to}: {error.strerror}") from None
     print(f"{count:,} datagrams sent to {to[0]}:{to[1]}")
     return 0
 
