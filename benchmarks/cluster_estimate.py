@@ -174,8 +174,8 @@ def estimate(a: Any) -> str:
     jobs = jobs_of(a.preset, not a.no_videos)
     guesses = {job.output: known.seconds(job) for job in jobs}
     seconds = {path: guess or 0.0 for path, guess in guesses.items()}
-    unknown = Counter(job.run.__name__ for job in jobs if guesses[job.output] is None)
-    kinds = Counter(job.run.__name__ for job in jobs)
+    unknown = Counter(job_times.kind(job) for job in jobs if guesses[job.output] is None)
+    kinds = Counter(job_times.kind(job) for job in jobs)
     lines = [f"Preset `{a.preset}`: " + ", ".join(f"{n:,} `{kind}`" for kind, n in kinds.items()) + "."]
     lines.append(f"Times per unit of work are those of `{a.run.name}`, measured on: {machine()}")
     if unknown:

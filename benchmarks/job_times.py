@@ -23,7 +23,7 @@ class Time:
     """How long a job took.
 
     Attributes:
-        kind: the name of its function.
+        kind: its function, for instance ``jobs.train``.
         env: environment.
         who: agent, row or expert.
         settings: a digest of those of a training; else empty.
@@ -46,7 +46,12 @@ def described(job: Job, seconds: float = 0.0) -> Time:
     who = next((known[name] for name in ("row", "agent", "expert") if name in known), "")
     config = known.get("config")
     settings = "" if config is None else digest(config)
-    return Time(job.run.__name__, env, who, settings, _amount(known), seconds)
+    return Time(kind(job), env, who, settings, _amount(known), seconds)
+
+
+def kind(job: Job) -> str:
+    """The function of a job, by its module and name."""
+    return f"{job.run.__module__.rpartition('.')[2]}.{job.run.__name__}"
 
 
 def _amount(known: dict[str, Any]) -> float:

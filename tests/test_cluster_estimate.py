@@ -70,11 +70,11 @@ def training(agent: str, config: dict, env: str = "E") -> Job:
 def test_the_most_similar_measured_jobs_count_by_their_amount_of_work():
     known = Estimate(
         [
-            Time("evaluate", "E", "rise", "", 100, 10),
-            Time("evaluate", "E", "rise", "", 300, 50),  # together 60 s for 400 episodes
-            Time("evaluate", "E", "rise-belief", "", 100, 30),
-            Time("evaluate", "E", "expert-cbf", "", 100, 70),
-            Time("evaluate", "F", "rise", "", 100, 1),
+            Time("jobs.evaluate", "E", "rise", "", 100, 10),
+            Time("jobs.evaluate", "E", "rise", "", 300, 50),  # together 60 s for 400 episodes
+            Time("jobs.evaluate", "E", "rise-belief", "", 100, 30),
+            Time("jobs.evaluate", "E", "expert-cbf", "", 100, 70),
+            Time("jobs.evaluate", "F", "rise", "", 100, 1),
         ]
     )
     assert known.seconds(evaluation("rise", 1000)) == pytest.approx(150)
@@ -102,10 +102,13 @@ def test_times_that_were_written_are_read_and_a_torn_line_is_skipped(tmp_path):
     watch(evaluation("rise", 100), 1.0, {})  # it failed, or was there
     watch(evaluation("pcbc", 200), 1.0, {"seconds": 2.0, "core_seconds": 1.0})
     with path.open("a") as file:
-        file.write("evaluate,E,ri")
+        file.write("jobs.evaluate,E,ri")
     assert heard == [0.5, 1.0, 1.0, 1.0]
     lines = job_times.read(path)
-    assert lines == [Time("evaluate", "E", "rise", "", 100, 4), Time("evaluate", "E", "pcbc", "", 200, 1)]
+    assert lines == [
+        Time("jobs.evaluate", "E", "rise", "", 100, 4),
+        Time("jobs.evaluate", "E", "pcbc", "", 200, 1),
+    ]
 
 
 def test_a_training_that_had_begun_before_is_no_measurement(tmp_path):
@@ -117,6 +120,12 @@ def test_a_training_that_had_begun_before_is_no_measurement(tmp_path):
     assert not path.exists()
     watch(done, 1.0, {"seconds": 51.0, "core_seconds": 50.0})
     assert len(job_times.read(path)) == 1
+
+
+def test_clips_and_traced_episodes_are_of_two_kinds():
+    """Both functions are called record, and count their work in units of their own."""
+    kinds = {job_times.kind(each) for each in jobs_of("smoke", videos=True)}
+    assert {"videos.record", "explorer.record", "jobs.train", "jobs.evaluate"} < kinds
 
 
 @pytest.fixture
@@ -141,7 +150,7 @@ def test_the_command_renews_the_block_of_a_page(measured, capsys):
     assert (
         f"| 1 | 1 | {work / 3600:.2f} | {work / 3600:.1f} | {work / 3600:.1f} | 100 % | {work:,.2f} |" in told
     )
-    assert "`train`" in told.partition("Not measured, and not counted:")[2].partition("\n")[0]
+    assert "`jobs.train`" in told.partition("Not measured, and not counted:")[2].partition("\n")[0]
     assert f"takes {(24 + 24 + 16) / 3600:.2f} h" in told
     assert page.read_text().startswith("before\n") and told.strip() in page.read_text()
 
