@@ -63,7 +63,7 @@ class Links(SphinxTransform):
                 words = node.astext() if isinstance(node.next_node(nodes.literal), nodes.literal) else ""
                 named = all(part.isidentifier() for part in words.split("."))
                 lead(node, "py", "obj", f"{module}.{words}" if named else module)
-            elif path.suffix == ".py":
+            elif path.parent == HERE / "examples":
                 lead(node, "doc", "myst", f"{catalogue.FOLDER}/examples/{path.stem}")
         for node in list(self.document.findall(addnodes.pending_xref)):
             name = Path(node["reftarget"].partition("#")[0]).name
