@@ -296,8 +296,8 @@ def _draw_bars(axis: Axes, rates: Mapping[int, Rate], colours: Sequence[str]) ->
         axis.barh(place, 100 * rate, height=0.66, color=paint)
         ends = [[100 * (rate - low)], [100 * (high - rate)]]
         axis.errorbar(100 * rate, place, xerr=ends, color=INK, elinewidth=1.4, capsize=3.5, capthick=1.4)
-        _beside(axis, place, 48, f"{percent(rate)} %", size=11, weight="bold", color=INK)
-        _beside(axis, place, 110, interval(low, high), size=9.5, color=FAINT)
+        _beside(axis, place, 55, f"{percent(rate)} %", size=11, weight="bold", color=INK)
+        _beside(axis, place, 119, interval(low, high), size=9.5, color=FAINT)
     axis.set(xlim=(0, 101.5), ylim=(len(colours) - 0.4, -0.6))
     axis.tick_params(axis="y", length=0)
     axis.grid(axis="x", color=GRID)

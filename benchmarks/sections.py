@@ -23,7 +23,9 @@ class Section:
 
 
 def sections(summary: Sequence[SummaryRow], blocks: Sequence[Mapping[str, Any]] = ()) -> list[Section]:
-    """The rows of each block of a run, those that were asked for first; other ones that are empty are left out.
+    """The rows of each block of a run, those that were asked for first, noise models in the order of the block.
+
+    Of a run that is not finished, other blocks are left out that have no two rows to compare yet.
 
     Args:
         summary: of the run.
@@ -31,13 +33,25 @@ def sections(summary: Sequence[SummaryRow], blocks: Sequence[Mapping[str, Any]] 
     """
     if not blocks:
         return [Section("", list(summary))]
-    found = [Section(block["title"], [row for row in summary if _belongs(row, block)]) for block in blocks]
-    return [found[0], *(section for section in found[1:] if section.rows)]
+    found = [Section(block["title"], _rows(summary, block)) for block in blocks]
+    others = zip(found[1:], blocks[1:], strict=True)
+    return [
+        found[0],
+        *(s for s, block in others if len({r.agent for r in s.rows}) >= min(2, len(block["rows"]))),
+    ]
 
 
 def compared(blocks: Sequence[Mapping[str, Any]]) -> list[frozenset[str]]:
     """The rows of each block, by name."""
     return [frozenset(block["rows"]) for block in blocks]
+
+
+def _rows(summary: Sequence[SummaryRow], block: Mapping[str, Any]) -> list[SummaryRow]:
+    """The rows of a block: task by task, its noise models in their order."""
+    envs = list(dict.fromkeys(row.env for row in summary))
+    models = list(dict.fromkeys([*block["noise_models"], *(row.noise_model for row in summary)]))
+    rows = [row for row in summary if _belongs(row, block)]
+    return sorted(rows, key=lambda row: (envs.index(row.env), models.index(row.noise_model)))
 
 
 def _belongs(row: SummaryRow, block: Mapping[str, Any]) -> bool:

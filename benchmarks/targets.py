@@ -86,6 +86,7 @@ TARGETS = (
         for other in ("pcbc", "cppo")
         for env in (VEHICLE, PANDA)
     ),
+    *(Target("rise-belief", "step", 1.0, env, (0.0, 0.0), SURELY_ABOVE, "cppo") for env in (VEHICLE, PANDA)),
     Target("rise-belief-shield", "step", 1.0, VEHICLE, (99.5, 98.0)),
     Target("rise-belief-shield", "step", 1.0, PANDA, (98.0, 97.0)),
     Target("rise-belief", "step", 1.0, VEHICLE, (98.0, 97.0)),
