@@ -170,6 +170,8 @@ def test_links_lead_to_files_and_headings_that_exist(page):
             continue
         name, _, anchor = target.partition("#")
         file = (page.parent / name).resolve() if name else page
+        if DOCS / "reference" in file.parents:  # is made, and links to it are checked, by `make docs`
+            continue
         assert file.exists() or file in PICTURES, f"{page_id(page)}: [{words}]({target})"
         assert not anchor or anchor in anchors(file), f"{page_id(page)}: no heading {target}"
 
