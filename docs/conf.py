@@ -30,7 +30,7 @@ version = release = rise_agents.__version__
 copyright = ""
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
-exclude_patterns = ["examples"]
+exclude_patterns = ["examples", "results/summary.md"]  # the latter: for forges; its content is in the page
 highlight_language = "text"  # of blocks that name none
 
 myst_heading_anchors = 4  # as forges name them
