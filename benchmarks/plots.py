@@ -262,20 +262,31 @@ def _panels(
     below = (0.005, 0.01, 0.99, 0.99 - header / height)
     layout = ConstrainedLayoutEngine(rect=below, h_pad=0.08, w_pad=0.08)
     figure = Figure(figsize=(_WIDTH, height), layout=layout)
-    figure.text(0.015, 1 - 0.14 / height, title, va="top", size=14.5, weight="bold", color=INK)
-    for place, line in enumerate(_lines(notes)):
-        below_title = 0.45 + _NOTE_HEIGHT * place
-        figure.text(0.015, 1 - below_title / height, line, va="top", size=10.5, color=FAINT)
+    head(figure, title, _lines(notes))
     axes = figure.subplots(len(envs), len(METRICS), squeeze=False).tolist()
     for env, pair in zip(envs, axes, strict=True):
         for axis, metric in zip(pair, METRICS, strict=True):
-            axis.set_title(f"{env_label(env)}: {metric.title}", loc="left", size=12, weight="bold", color=INK)
-            axis.spines[["top", "right"]].set_visible(False)
-            axis.tick_params(labelsize=10.5, colors=INK)
-            axis.xaxis.label.set(size=10, color=FAINT)
-            axis.yaxis.label.set(size=10, color=FAINT)
-            axis.set_axisbelow(True)
+            style(axis, f"{env_label(env)}: {metric.title}")
     return figure, axes
+
+
+def head(figure: Figure, title: str, notes: Sequence[str]) -> None:
+    """Write a title over a figure, and lines of notes below it."""
+    height = figure.get_figheight()
+    figure.text(0.015, 1 - 0.14 / height, title, va="top", size=14.5, weight="bold", color=INK)
+    for place, line in enumerate(notes):
+        below_title = 0.45 + _NOTE_HEIGHT * place
+        figure.text(0.015, 1 - below_title / height, line, va="top", size=10.5, color=FAINT)
+
+
+def style(axis: Axes, title: str) -> None:
+    """Give a panel its title and the look of all panels."""
+    axis.set_title(title, loc="left", size=12, weight="bold", color=INK)
+    axis.spines[["top", "right"]].set_visible(False)
+    axis.tick_params(labelsize=10.5, colors=INK)
+    axis.xaxis.label.set(size=10, color=FAINT)
+    axis.yaxis.label.set(size=10, color=FAINT)
+    axis.set_axisbelow(True)
 
 
 def _draw_bars(axis: Axes, rates: Mapping[int, Rate], colours: Sequence[str]) -> None:

@@ -11,7 +11,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 
 from benchmarks.labels import agent_label, env_label
-from benchmarks.plots import FAINT, GRID, INK, colour
+from benchmarks.plots import FAINT, GRID, INK, colour, head, style
 from benchmarks.tune.ranking import Rates
 
 _TOP = 0.99  # inches that the words above the panels take
@@ -44,8 +44,7 @@ def figure(
     height = _TOP + 4.2
     layout = ConstrainedLayoutEngine(rect=(0.005, 0.01, 0.99, 0.99 - _TOP / height), w_pad=0.1)
     drawn = Figure(figsize=(max(5.4, 5.0 * len(envs)), height), layout=layout)
-    drawn.text(0.015, 1 - 0.14 / height, _TITLE, va="top", size=14.5, weight="bold", color=INK)
-    drawn.text(0.015, 1 - 0.45 / height, _NOTE, va="top", size=10.5, color=FAINT)
+    head(drawn, _TITLE, [_NOTE])
     for env, axis in zip(envs, drawn.subplots(1, len(envs), squeeze=False)[0], strict=True):
         left = 100 * best[env].clean - _SHOWN
         for agent in agents:
@@ -58,7 +57,7 @@ def figure(
         if lost := sum(100 * rates.clean < left for rates in every):
             axis.text(0.02, 0.02, f"← {lost} further left", transform=axis.transAxes, size=10, color=FAINT)
         _limit(axis, 100 * (best[env].clean - clean_loss))
-        axis.set_title(env_label(env), loc="left", size=12, weight="bold", color=INK)
+        style(axis, env_label(env))
         axis.set(xlabel="on true readings", ylabel="at noise level 1")
     drawn.legend(
         handles=_legend(agents),
@@ -86,12 +85,7 @@ def _draw(axis: Axes, trials: Mapping[int, tuple[Rates, int]], chosen: int | Non
 def _limit(axis: Axes, where: float) -> None:
     """The end of what may be lost; how far below it a setting may lie depends on how well it is known."""
     axis.axvline(where, color=FAINT, linestyle="--", linewidth=1, zorder=1)
-    axis.spines[["top", "right"]].set_visible(False)
-    axis.tick_params(labelsize=10.5, colors=INK)
-    axis.xaxis.label.set(size=10, color=FAINT)
-    axis.yaxis.label.set(size=10, color=FAINT)
     axis.grid(color=GRID)
-    axis.set_axisbelow(True)
 
 
 def _legend(agents: Sequence[str]) -> list[Line2D]:
