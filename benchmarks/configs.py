@@ -1,9 +1,10 @@
 """Config files: settings of agents, and variants of agents, which are rows of their own.
 
-A file is TOML. Tables named after an agent, or ``agent@environment``, hold settings. A table ``variants.NAME`` makes a
-row called NAME: ``agent`` says whose variant it is, and all other keys but the following are settings, laid over those
-of its agent: ``label`` (as people read it), ``envs`` (only there), ``expert`` (who demonstrates for this row alone).
-A table ``variants."NAME@environment"`` holds settings of a variant for one environment::
+A file is TOML. Tables named after an agent or a variant, or either with ``@environment``, hold settings. A table
+``variants.NAME`` makes a row called NAME: ``agent`` says whose variant it is, and all other keys but the following are
+settings, laid over those of its agent: ``label`` (as people read it), ``envs`` (only there), ``expert`` (who
+demonstrates for this row alone), ``search`` (values that :mod:`benchmarks.tune` tries, beside what it tries of the
+agent)::
 
     [rise]
     beta = 0.1
@@ -12,6 +13,10 @@ A table ``variants."NAME@environment"`` holds settings of a variant for one envi
     agent = "rise"
     label = "RISE, large"
     hidden = [512, 512]
+    search.batch_size = [256, 1024]
+
+    ["rise-large@RISE-SafePanda-v0"]
+    beta = 0.05
 
 ``benchmarks/configs/variants.toml`` is always read. Settings of a later file take the place of those of an earlier one.
 """
@@ -64,10 +69,12 @@ class Configs:
     Attributes:
         variants: by name.
         layers: settings, those of each file.
+        searches: of variants, the values to try of settings.
     """
 
     variants: dict[str, Variant] = field(default_factory=dict)
     layers: tuple[Settings, ...] = ()
+    searches: dict[str, dict[str, list[Any]]] = field(default_factory=dict)
 
 
 def read(paths: Iterable[Path]) -> Configs:
@@ -78,18 +85,17 @@ def read(paths: Iterable[Path]) -> Configs:
     """
     variants: dict[str, Variant] = {}
     layers: list[Settings] = []
+    searches: dict[str, dict[str, list[Any]]] = {}
     for path in paths:
         tables = _tables(path)
         layer: Settings = {}
+        for place, name, entries in _named(path, tables.pop("variants", {})):
+            variant, layer[name], searches[name] = _variant(place, name, entries, variants)
+            variants[name] = variant
         for name, entries in tables.items():
-            if name != "variants":
-                layer[name] = _of_agent(_place(path, name), name, entries)
-        for place, name, entries in _named(path, tables.get("variants", {})):
-            variant, layer[name] = _variant(place, name, entries, variants)
-            if variant is not None:
-                variants[name] = variant
+            layer[name] = _of_row(_place(path, name), name, entries, variants)
         layers.append(layer)
-    return Configs(variants, tuple(layers))
+    return Configs(variants, tuple(layers), {name: each for name, each in searches.items() if each})
 
 
 def laid_over(layers: Iterable[Mapping[str, Mapping[str, Any]]]) -> Settings:
@@ -123,32 +129,27 @@ def _place(path: Path, table: str) -> str:
 
 
 def _named(path: Path, tables: Any) -> Iterator[tuple[str, str, Any]]:
-    """Where each variant stands in the file, its name and its entries; those of one environment last."""
+    """Where each variant stands in the file, its name and its entries."""
     if not isinstance(tables, dict):
         raise ValueError(f"{_place(path, 'variants')} holds tables, as in [variants.NAME], got {tables!r}")
-    for name in sorted(tables, key=lambda name: "@" in name):
-        yield _place(path, f"variants.{name}"), name, tables[name]
+    for name, entries in tables.items():
+        yield _place(path, f"variants.{name}"), name, entries
 
 
-def _of_agent(place: str, name: str, entries: Any) -> dict[str, Any]:
-    """The settings in a table of an agent, checked."""
-    agent, at, env = name.partition("@")
-    if agent not in AGENTS:
-        raise ValueError(f"{place} names no agent: {nearest(agent, [*AGENTS, 'variants'])}")
+def _of_row(place: str, name: str, entries: Any, variants: Mapping[str, Variant]) -> dict[str, Any]:
+    """The settings in a table of an agent or a variant, checked."""
+    row, at, env = name.partition("@")
+    if row not in AGENTS and row not in variants:
+        known = [*AGENTS, *variants, "variants"]
+        raise ValueError(f"{place} names no agent and no variant: {nearest(row, known)}")
     _check_env(place, env, at)
-    return _settings(place, agent, entries)
+    return _settings(place, variants[row].agent if row in variants else row, entries)
 
 
 def _variant(
     place: str, name: str, entries: Any, known: Mapping[str, Variant]
-) -> tuple[Variant | None, dict[str, Any]]:
-    """A variant, or None where one that is known gets settings for an environment; and these settings, checked."""
-    base, at, env = name.partition("@")
-    if at:
-        if base not in known:
-            raise ValueError(f"{place} names no variant: {nearest(base, known)}")
-        _check_env(place, env, at)
-        return None, _settings(place, known[base].agent, entries)
+) -> tuple[Variant, dict[str, Any], dict[str, list[Any]]]:
+    """A variant, its settings, and the values of settings that a search tries, all checked."""
     if not _NAME.fullmatch(name) or name in AGENTS or re.split("[-.]", name)[0] in REFERENCES:
         raise ValueError(f"{place} needs a name of letters, digits, '.', '_', '-' that means nothing else")
     if name in known:
@@ -159,8 +160,20 @@ def _variant(
     about = {key: value for key, value in entries.items() if key in Variant.__annotations__}
     variant = Variant(**plain(about))
     _check_variant(place, variant)
-    rest = {key: value for key, value in entries.items() if key not in about}
-    return variant, _settings(place, variant.agent, rest)
+    rest = {key: value for key, value in entries.items() if key not in (*about, "search")}
+    return variant, _settings(place, variant.agent, rest), _tried(place, variant, entries.get("search", {}))
+
+
+def _tried(place: str, variant: Variant, tried: Any) -> dict[str, list[Any]]:
+    """Lists of settings, each value as it must be."""
+    if not isinstance(tried, dict) or not all(isinstance(each, list) and each for each in tried.values()):
+        raise ValueError(
+            f"{place} search must hold lists of values, as in search.FIELD = [1, 2], got {tried!r}"
+        )
+    for name, values in tried.items():
+        for value in values:
+            _settings(place, variant.agent, {name: value})
+    return tried
 
 
 def _check_variant(place: str, variant: Variant) -> None:

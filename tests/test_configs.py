@@ -28,7 +28,7 @@ agent = "rise"
 label = "RISE, large"
 hidden = [512, 512]
 
-[variants."rise-large@{PANDA}"]
+["rise-large@{PANDA}"]
 latent = 9
 
 [variants."pcbc0.5"]
@@ -36,6 +36,7 @@ agent = "pcbc"
 envs = ["{VEHICLE}"]
 expert = "cbf"
 train_noise = 0.5
+search.train_noise = [0.25, 1]
 """
 
 
@@ -66,6 +67,7 @@ def test_a_file_says_variants_and_settings(file):
             "pcbc0.5": {"train_noise": 0.5},
         },
     )
+    assert found.searches == {"pcbc0.5": {"train_noise": [0.25, 1]}}
 
 
 def test_settings_lie_over_each_other_in_order(file):
@@ -85,7 +87,7 @@ def test_settings_lie_over_each_other_in_order(file):
 
 def test_later_files_win(file, tmp_path):
     other = tmp_path / "other.toml"
-    other.write_text(f'[rise]\nbeta = 0.4\n[variants."rise-large@{VEHICLE}"]\nlatent = 3\n')
+    other.write_text(f'[rise]\nbeta = 0.4\n["rise-large@{VEHICLE}"]\nlatent = 3\n')
     run = plan(("rise", "rise-large"), {}, [file, other])
     assert run.config("rise", VEHICLE) == {"beta": 0.4, "hidden": [64, 64]}
     assert run.config("rise-large", VEHICLE)["latent"] == 3
@@ -132,7 +134,7 @@ def test_every_shipped_variant_is_sound():
     ("text", "says"),
     [
         ("[rise", "is no TOML"),
-        ("[rize]\nbeta = 1", "table 'rize': names no agent: did you mean 'rise'"),
+        ("[rize]\nbeta = 1", "table 'rize': names no agent and no variant: did you mean 'rise'"),
         ("rise = 3", "table 'rise': must be a table of settings, got 3"),
         ("variants = 3", "holds tables, as in [variants.NAME]"),
         ("[rise]\nbetta = 1", "table 'rise': unknown setting 'betta' of rise.Config: did you mean 'beta'"),
@@ -155,8 +157,12 @@ def test_every_shipped_variant_is_sound():
         ("[variants.'a/b']\nagent = 'rise'", "needs a name"),
         ('[variants."a\\nb"]\nagent = "rise"', "needs a name"),
         ("[variants.rise-mean]\nagent = 'rise'", "'variants.rise-mean': is there already"),
-        ('[variants."rise-men@RISE-SafePanda-v0"]\nbeta = 1', "names no variant: did you mean 'rise-mean'"),
-        ('[variants."rise-mean@RISE-SafePanda-v0"]\nlabel = "x"', "unknown setting 'label'"),
+        ('["rise-men@RISE-SafePanda-v0"]\nbeta = 1', "no variant: did you mean 'rise-mean'"),
+        ('["rise-mean@RISE-SafePanda-v0"]\nlabel = "x"', "unknown setting 'label'"),
+        ('[variants."rise@RISE-SafePanda-v0"]\nagent = "rise"', "needs a name"),
+        ("[variants.mine]\nagent = 'rise'\nsearch = 3", "search must hold lists of values"),
+        ("[variants.mine]\nagent = 'rise'\nsearch.beta = []", "search must hold lists of values"),
+        ("[variants.mine]\nagent = 'rise'\nsearch.latent = [4, 1.5]", "latent must be a whole number"),
     ],
 )
 def test_what_is_wrong_is_said_in_one_line_that_names_the_file(tmp_path, text, says):

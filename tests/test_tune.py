@@ -14,8 +14,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from benchmarks import configs
+from benchmarks.configs import SHIPPED
 from benchmarks.executors import Failure
 from benchmarks.plots import colour
+from benchmarks.protocol import make_plan
 from benchmarks.tune import report, search, settings_file
 from benchmarks.tune.__main__ import main, parser, search_of
 from benchmarks.tune.figure import figure
@@ -24,6 +27,7 @@ from benchmarks.tune.studies import drawn_trials
 from rise_agents import AGENTS, agent_class, load_agent, make_agent
 from rise_agents.agent import make_config
 from rise_agents.pcbc import PCBC
+from rise_agents.readings import FRAMES
 from rise_agents.rollout import rollout
 from rise_agents.search import EVERYWHERE, Choice, LogRange, draw, space_of
 from rise_agents.seeds import SPLITS
@@ -179,6 +183,43 @@ def test_a_longer_search_begins_with_the_trials_of_a_shorter_one():
     assert len({json.dumps(trial) for trial in long}) == 9
     assert all(trial["latent"] == 4 for trial in long)
     assert drawn_trials("rise", PANDA, 3, {})[1] != drawn_trials("rise", VEHICLE, 3, {})[1]
+
+
+def test_what_a_variant_wants_tried_is_and_its_other_settings_stay(tmp_path):
+    """Trial 0 is the variant as it is; ``--set`` takes a setting out of the search."""
+    mine = tmp_path / "mine.toml"
+    mine.write_text(
+        '[variants.noisy]\nagent = "pcbc"\nbatch_size = 64\ntrain_noise = 1.0\n'
+        "search.train_noise = [0.25, 0.5]\nsearch.n_samples = [3]\n"
+    )
+    command = ["--agents", "noisy", "--envs", VEHICLE, "--config", str(mine), "--trials", "40"]
+    study = search_of(parser().parse_args(command)).study("noisy", VEHICLE)
+    common = {"transitions": 10_000, "batch_size": 64}
+    assert (study.name, study.agent) == (f"noisy@{VEHICLE}", "pcbc")
+    assert study.trials[0] == {**common, "train_noise": 1.0}
+    assert {trial["train_noise"] for trial in study.trials[1:]} == {0.25, 0.5}
+    assert all(trial["n_samples"] == 3 and common.items() <= trial.items() for trial in study.trials[1:])
+    assert {trial["frame"] for trial in study.trials[1:]} == set(FRAMES)
+    fixed = search_of(parser().parse_args([*command, "--set", "noisy.train_noise=0.75"]))
+    assert {trial["train_noise"] for trial in fixed.study("noisy", VEHICLE).trials} == {0.75}
+
+
+def test_the_found_settings_of_a_variant_are_all_there_and_hold_in_a_run(tmp_path, monkeypatch):
+    """Also those that are as the agent's defaults: what is left out would be as was found for the agent."""
+    run, _ = made_up(lambda settings, seed: Rates(1.0, 1.0, 0.5, 0.6 if len(settings) > 3 else 0.4))
+    monkeypatch.setattr(search, "run_jobs", run)
+    monkeypatch.setattr(search, "_recorded", lambda *a: ({VEHICLE: (tmp_path, "d")}, []))
+    command = ["--agents", "pcbc-noisy", "--envs", VEHICLE, "--trials", "2", "--out", str(tmp_path)]
+    assert main(command) == 0
+    written = tmp_path / "tuned.toml"
+    trial = drawn_trials(
+        "pcbc", VEHICLE, 2, {}, "pcbc-noisy", configs.read([SHIPPED]).searches["pcbc-noisy"]
+    )[1]
+    assert tomllib.loads(written.read_text()) == {f"pcbc-noisy@{VEHICLE}": trial}
+    with written.open("a") as file:
+        file.write(f'["pcbc@{VEHICLE}"]\nframe = "world"\nbatch_size = 64\n')
+    plan = make_plan("quick", {}, [written], agents=("pcbc-noisy",), envs=(VEHICLE,))
+    assert plan.config("pcbc-noisy", VEHICLE) == {"batch_size": 64, **trial}
 
 
 # --- settings files --------------------------------------------------------------------------------------------
@@ -470,6 +511,9 @@ def test_a_result_that_is_none_is_named(tuned, capsys):
     [
         (["--agents", "rize"], "did you mean 'rise'"),
         (["--agents", "expert"], "unknown agent 'expert'"),
+        (["--agents", "pcbc-noise"], "did you mean 'pcbc-noisy'"),
+        (["--agents", "rise-cbf"], "rise-cbf has demonstrations of its own: search settings of rise"),
+        (["--config", "none.toml"], "cannot read the config file 'none.toml'"),
         (["--envs", "RISE-SafePnda-v0"], "did you mean 'RISE-SafePanda-v0'"),
         (["--trials", "0"], "trials must be"),
         (["--seeds", "0"], "seeds must be"),

@@ -41,7 +41,15 @@ def parser() -> Parser:
         nargs="+",
         default=["rise", "pcbc", "cppo"],
         metavar="NAME",
-        help="agents to search settings of (default: rise pcbc cppo)",
+        help="agents, or variants of them, to search settings of (default: rise pcbc cppo)",
+    )
+    p.add_argument(
+        "--config",
+        nargs="+",
+        default=[],
+        type=Path,
+        metavar="FILE",
+        help="config files with variants, and settings that are the same in all trials",
     )
     p.add_argument(
         "--envs", nargs="+", metavar="ID", help="environments (default: all whose results are reported)"
@@ -132,6 +140,7 @@ def parser() -> Parser:
 
 def search_of(a: argparse.Namespace) -> Search:
     """The search that the arguments ask for; raises ``ValueError`` for what can be known to fail before any work."""
+    from benchmarks import configs
     from benchmarks.protocol import make_plan
     from benchmarks.tune import settings_file
     from benchmarks.tune.ranking import MODEL
@@ -143,12 +152,15 @@ def search_of(a: argparse.Namespace) -> Search:
         raise ValueError(f"--workers must be at least 1, got {a.workers}")
     if not a.checkpoint_every >= 0:
         raise ValueError(f"--checkpoint-every must not be negative, got {a.checkpoint_every}")
+    given = parse_settings(a.settings)
+    read = configs.read(configs.files(False, a.config))
     for name in a.agents:
-        if name not in AGENTS:
-            raise ValueError(f"unknown agent {name!r}: {nearest(name, AGENTS)}")
+        if name not in AGENTS and name not in read.variants:
+            raise ValueError(f"unknown agent {name!r}: {nearest(name, [*AGENTS, *read.variants])}")
     plan = make_plan(
         "quick",
-        parse_settings(a.settings),
+        given,
+        a.config,
         agents=tuple(dict.fromkeys(a.agents)),
         envs=tuple(dict.fromkeys(a.envs or [env for env in ENVS if env not in STAND_INS])),
         demos=a.episodes,
@@ -157,9 +169,13 @@ def search_of(a: argparse.Namespace) -> Search:
         seeds=a.seeds,
         expert=a.expert,
     )
-    search = Search(plan, a.trials, a.transitions, a.clean_loss / 100, a.eval_env, tuple(a.demos))
-    for agent, env in search.pairs():
-        search.study(agent, env)
+    tried = {
+        row: {name: each for name, each in own.items() if name not in given.get(row, {})}
+        for row, own in read.searches.items()
+    }
+    search = Search(plan, a.trials, a.transitions, a.clean_loss / 100, a.eval_env, tuple(a.demos), tried)
+    for row, env in search.pairs():
+        search.study(row, env)
     if a.write is not None:
         settings_file.read(a.write)
     if a.tensorboard is not None:

@@ -48,12 +48,18 @@ class Found:
 
 
 def chosen_settings(found: Found) -> dict[str, Any]:
-    """The settings that differ from the agent's defaults; from how much it learned is a condition and no choice."""
+    """The settings that differ from the agent's defaults; from how much it learned is a condition and no choice.
+
+    Of a variant all that were searched: what is left out would be as its agent's.
+    """
     study = found.study
     defaults = config_to_dict(make_config(agent_class(study.agent), study.env, {}))
+    searched = {name for trial in study.trials[1:] for name in trial} if study.row != study.agent else set()
     settings = study.settings(found.chosen)
     return {
-        name: value for name, value in settings.items() if value != defaults[name] and name != "transitions"
+        name: value
+        for name, value in settings.items()
+        if (name in searched or value != defaults[name]) and name != "transitions"
     }
 
 
@@ -126,7 +132,7 @@ def write_trials(path: Path, studies: Sequence[Study], seeds: int, out: Path) ->
                 rates = study.rates(trial, seed, out)
                 if rates is None:
                     continue
-                line = {"agent": study.agent, "env": study.env, "trial": trial, "train_seed": seed}
+                line = {"agent": study.row, "env": study.env, "trial": trial, "train_seed": seed}
                 line |= {"settings": json.dumps(study.trials[trial], sort_keys=True)}
                 line |= {name: f"{rate:.6g}" for name, rate in rates._asdict().items()}
                 result = study.result(trial, seed, out)

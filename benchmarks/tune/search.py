@@ -6,11 +6,12 @@ import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from benchmarks.display import Display
 from benchmarks.executors import Failure, MakeCrew, run_jobs
 from benchmarks.jobs import Job, demonstrations_folder, recording_jobs, tidy, wanted, with_events
-from benchmarks.labels import count
+from benchmarks.labels import count, name_rows
 from benchmarks.plots import save_png
 from benchmarks.protocol import Plan, imitates
 from benchmarks.tune import known, report
@@ -35,6 +36,7 @@ class Search:
         clean_loss: what the chosen settings may lose on true readings, in [0, 1].
         eval_env: a stand-in that agents of what it models are judged in; empty: none.
         sets: folders of recorded demonstrations.
+        tried: of variants, values of settings to try beside what is tried of their agents.
     """
 
     plan: Plan
@@ -43,35 +45,42 @@ class Search:
     clean_loss: float
     eval_env: str = ""
     sets: tuple[Path, ...] = ()
+    tried: Mapping[str, Mapping[str, list[Any]]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name, value, low in (("trials", self.trials, 1), ("transitions", self.transitions, 0)):
             if value < low:
                 raise ValueError(f"{name} must be at least {low}, got {value}")
+        for name, variant in self.plan.variants.items():
+            if variant.expert:
+                raise ValueError(
+                    f"{name} has demonstrations of its own: search settings of {variant.agent} instead"
+                )
         if not 0 <= self.clean_loss <= 1:
             raise ValueError(f"the clean loss must lie from 0 to 100 points, got {100 * self.clean_loss:g}")
         if self.eval_env and STAND_INS.get(self.eval_env) not in self.plan.envs:
             known = ", ".join(f"{name} for {env}" for name, env in STAND_INS.items())
             raise ValueError(f"{self.eval_env!r} stands in for no environment of this search; known: {known}")
 
-    def study(self, agent: str, env: str, source: tuple[Path, str] | None = None) -> Study:
-        """An agent in an environment, learning from the set in a folder with a digest.
+    def study(self, row: str, env: str, source: tuple[Path, str] | None = None) -> Study:
+        """A row in an environment, learning from the set in a folder with a digest.
 
         Raises:
-            ValueError: the agent declares no space, or its settings make no sense.
+            ValueError: its agent declares no space, or its settings make no sense.
         """
-        fixed = {**condition(agent, self.transitions), **self.plan.config(agent, env)}
+        agent = self.plan.agent_of(row)
+        own = {**condition(agent, self.transitions), **self.plan.config(row, env)}
         try:
-            trials = drawn_trials(agent, env, self.trials, fixed)
+            trials = drawn_trials(agent, env, self.trials, own, row, self.tried.get(row, {}))
         except ValueError as error:
-            raise ValueError(f"settings of {agent}: {error}") from None
+            raise ValueError(f"settings of {row}: {error}") from None
         judged = self.eval_env if STAND_INS.get(self.eval_env) == env else env
         data, digest = source if source is not None and imitates(agent) else (None, "")
-        return Study(agent, env, judged, self.plan.episodes, trials, data, digest)
+        return Study(row, agent, env, judged, self.plan.episodes, trials, data, digest)
 
     def pairs(self) -> list[tuple[str, str]]:
-        """(agent, environment) of each study."""
-        return [(agent, env) for env in self.plan.envs for agent in self.plan.agents]
+        """(row, environment) of each study."""
+        return [(row, env) for env in self.plan.envs for row in self.plan.asked(env)]
 
 
 @dataclass(frozen=True)
@@ -130,14 +139,15 @@ def execute(search: Search, sets: Mapping[str, tuple[Path, str]], out: Path, how
     Raises:
         ValueError: recorded demonstrations do not suffice, or a file is not what it should be.
     """
+    name_rows({name: variant.label for name, variant in search.plan.variants.items() if variant.label})
     for folder in [out, *(path for path in out.rglob("*") if path.is_dir())]:
         sweep(folder)
     tidy(out)
     sources, failures = _recorded(search, sets, out, how)
     studies = [
-        search.study(agent, env, sources.get(env))
-        for agent, env in search.pairs()
-        if env in sources or not imitates(agent)
+        search.study(row, env, sources.get(env))
+        for row, env in search.pairs()
+        if env in sources or not search.plan.learns_from_expert(row)
     ]
     if how.known:
         taken = known.recall(studies, search.plan.seeds, how.known, out)
@@ -166,7 +176,7 @@ def execute(search: Search, sets: Mapping[str, tuple[Path, str]], out: Path, how
             found.append(report.Found(study, *numbers))
     report.write_trials(out / "trials.csv", studies, len(seeds), out)
     if best:
-        winners = {(each.study.agent, each.study.env): each.chosen for each in found}
+        winners = {(each.study.row, each.study.env): each.chosen for each in found}
         save_png(figure(_marks(studies, seeds, out), winners, search.clean_loss, best), out / "search.png")
     tables = report.tables(found, how.command, search.clean_loss)
     for path in [out / "tuned.toml", *([how.write] if how.write else [])]:
@@ -182,7 +192,7 @@ def _marks(studies: Sequence[Study], seeds: Sequence[int], out: Path) -> Marks:
         for trial in range(len(study.trials)):
             measured = [rates for seed in seeds if (rates := study.rates(trial, seed, out))]
             if measured:
-                marks.setdefault((study.agent, study.env), {})[trial] = mean(measured), len(measured)
+                marks.setdefault((study.row, study.env), {})[trial] = mean(measured), len(measured)
     return marks
 
 

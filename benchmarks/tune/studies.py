@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -16,24 +18,26 @@ from benchmarks.tune.ranking import CLEAN, MODEL, NOISY, Rates
 from rise_agents import __version__, agent_class, load_agent
 from rise_agents.agent import Progress, config_to_dict, make_config
 from rise_agents.rollout import rollout
-from rise_agents.search import draw, space_of
+from rise_agents.search import Choice, draw, space_of
 from rise_agents.seeds import episode_seeds
 
 
 @dataclass(frozen=True, eq=False)  # compared by identity: settings are dicts, which have no hash
 class Study:
-    """One agent in one environment, and what is tried there.
+    """One row in one environment, and what is tried there.
 
     Attributes:
-        agent: registered name.
+        row: an agent, or a variant of one.
+        agent: who is trained for it, a registered name.
         env: where it is meant to act.
         eval_env: where it is judged: ``env`` or what stands in for it.
         scenarios: validation scenarios that it is judged on.
-        trials: settings that differ from the agent's defaults; the first of them are the defaults.
+        trials: settings that differ from the agent's defaults; the first of them are the row's own.
         data: the demonstrations to learn from, if it imitates.
         source: names them by their content.
     """
 
+    row: str
     agent: str
     env: str
     eval_env: str
@@ -45,7 +49,7 @@ class Study:
     @property
     def name(self) -> str:
         """As settings files call it."""
-        return f"{self.agent}@{self.env}"
+        return f"{self.row}@{self.env}"
 
     def settings(self, trial: int) -> dict[str, Any]:
         """All settings of a trial, defaults included."""
@@ -64,7 +68,7 @@ class Study:
     def jobs(self, trial: int, seed: int, out: Path, every: float) -> list[Job]:
         """Train and judge a trial; ``every`` so many seconds the training stores its state."""
         checkpoint, result = self.checkpoint(trial, seed, out), self.result(trial, seed, out)
-        which = f"{self.agent} on {self.env}, trial {trial}, seed {seed}"
+        which = f"{self.row} on {self.env}, trial {trial}, seed {seed}"
         learn: dict[str, Any] = {"env": self.env, "agent": self.agent, "seed": seed, "data": self.data}
         learn |= {"config": self.trials[trial], "device": "cpu", "every": every}
         tell: dict[str, Any] = {"checkpoint": checkpoint, "env": self.eval_env, "scenarios": self.scenarios}
@@ -84,18 +88,37 @@ class Study:
         return Rates(*read_result(path)["rates"].values()) if path.exists() else None
 
 
-def drawn_trials(agent: str, env: str, count: int, fixed: dict[str, Any]) -> tuple[dict[str, Any], ...]:
-    """The settings of ``count`` trials: the defaults, then random ones; those in ``fixed`` are the same in all.
+def drawn_trials(
+    agent: str,
+    env: str,
+    count: int,
+    own: dict[str, Any],
+    variant: str = "",
+    tried: Mapping[str, Sequence[Any]] = MappingProxyType({}),
+) -> tuple[dict[str, Any], ...]:
+    """The settings of ``count`` trials: the row's own, then random ones.
 
-    A trial's settings depend on agent, environment and its number only: a longer search begins like a short one.
+    A trial's settings depend on row, environment and its number only: a longer search begins like a short one.
+
+    Args:
+        agent: who is trained.
+        env: where.
+        count: how many.
+        own: settings of the row, the same in all trials but for those that are tried.
+        variant: the row, if it is not the agent itself.
+        tried: values to try, beside what the agent's class declares.
 
     Raises:
-        ValueError: the agent declares no space, or a fixed setting is unknown or out of range.
+        ValueError: the agent declares no space, or a setting is unknown or out of range.
     """
-    space = space_of(agent_class(agent), env)
-    trials = [fixed]
+    space = {
+        **space_of(agent_class(agent), env),
+        **{name: Choice(tuple(each)) for name, each in tried.items()},
+    }
+    fixed = {name: value for name, value in own.items() if name not in tried}
+    trials = [own]
     for number in range(1, count):
-        rng = np.random.default_rng([int(digest(agent, env), 16), number])
+        rng = np.random.default_rng([int(digest(variant or agent, env), 16), number])
         trials.append({**draw(space, rng), **fixed})
     for settings in trials:
         make_config(agent_class(agent), env, settings)
