@@ -234,7 +234,6 @@ def seeded(seed: int, device: str) -> torch.Generator:
 
     keep_freed_memory()
     torch.manual_seed(seed)
-    torch.set_num_threads(1)  # a second thread makes networks of this size slower, not faster
     return torch.Generator(device=device).manual_seed(seed)
 
 

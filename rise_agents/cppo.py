@@ -11,8 +11,7 @@ Shapes: B batch, K network inputs, A action dimensions.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
@@ -41,7 +40,7 @@ from rise_agents.resume import Resume
 from rise_agents.search import EVERYWHERE, Choice, LogRange, Space
 from rise_agents.seeds import episode_seeds
 from rise_agents.vec_env import action_bounds, as_vector_env, make_training_env, random_inputs
-from rise_agents.workers import keep_freed_memory
+from rise_agents.workers import keep_freed_memory, one_thread
 from rise_envs import ENVS
 from rise_envs.task import Task
 
@@ -155,9 +154,11 @@ class CPPO:
         finally:
             venv.close()
 
+    @one_thread()
     def _learn(self, venv: VectorEnv, progress: Progress, kept: Resume, source: str) -> CPPO:
         from rise_agents.bridge import Bridge  # here and not above: see there
 
+        keep_freed_memory()
         c, bounds = self.config, action_bounds(venv.single_action_space)
         ranks = self._ranks(venv.single_observation_space)
         c.check_batch(venv.num_envs)
@@ -169,21 +170,20 @@ class CPPO:
         constants = units.arrays("units")
         if bounds is not None:
             constants |= {"action.low": bounds[0], "action.high": bounds[1]}
-        with _one_thread():
-            ppo = self._trainer(bridge, kept.noting(progress))
+        ppo = self._trainer(bridge, kept.noting(progress))
 
-            def store() -> None:
-                weights, facts = ppo.snapshot()
-                kept.save({**weights, **constants}, facts)
+        def store() -> None:
+            weights, facts = ppo.snapshot()
+            kept.save({**weights, **constants}, facts)
 
-            ppo.at_restart = lambda: store() if kept.due() else None
-            if arrays:
-                kept.read(lambda: ppo.restore(arrays, notes, c.total_steps))
-            if ppo.num_timesteps < c.total_steps:
-                left = c.total_steps - ppo.num_timesteps
-                # No logging: None is taken, whatever the annotation says.
-                ppo.learn(left, log_interval=None, reset_num_timesteps=not arrays)  # type: ignore[arg-type]
-                store()
+        ppo.at_restart = lambda: store() if kept.due() else None
+        if arrays:
+            kept.read(lambda: ppo.restore(arrays, notes, c.total_steps))
+        if ppo.num_timesteps < c.total_steps:
+            left = c.total_steps - ppo.num_timesteps
+            # No logging: None is taken, whatever the annotation says.
+            ppo.learn(left, log_interval=None, reset_num_timesteps=not arrays)  # type: ignore[arg-type]
+            store()
         self._arrays, self._notes = ppo.snapshot()
         self._arrays |= constants
         self._notes["ranks"] = ranks
@@ -346,17 +346,3 @@ def _check_known(env_id: str) -> None:
 
 def _linear(first: float, last: float) -> Callable[[float], float]:
     return lambda remaining: last + (first - last) * remaining
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Networks this small lose time to a second thread; and one thread sums in one order."""
-    import torch
-
-    keep_freed_memory()
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)

@@ -23,6 +23,7 @@ from rise_agents.files import StrPath
 from rise_agents.readings import checked_batch
 from rise_agents.resume import Resume
 from rise_agents.search import EVERYWHERE, Space
+from rise_agents.workers import one_thread
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,7 @@ class PCBC:
         self.task, self.units = cloning.make_task(env_id), ActionUnits.of(env_id)
         self._arrays: dict[str, NDArray] = {}
 
+    @one_thread()
     def learn(self, source: Any, progress: Progress = silent, resume: Resume | StrPath | None = None) -> PCBC:
         """Clone :class:`rise_agents.demonstrations.Demonstrations`; see :class:`rise_agents.agent.Agent`."""
         c = self.config

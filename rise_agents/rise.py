@@ -41,6 +41,7 @@ from rise_agents.files import StrPath
 from rise_agents.forward import LOG_SIGMA_RANGE, Forward, layers_of, standardised
 from rise_agents.resume import Resume
 from rise_agents.search import EVERYWHERE, Choice, LogRange, Space
+from rise_agents.workers import one_thread
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -126,6 +127,7 @@ class Rise:
         self._rng = np.random.default_rng(seed)
         self._arrays: dict[str, NDArray] = {}
 
+    @one_thread()
     def learn(self, source: Any, progress: Progress = silent, resume: Resume | StrPath | None = None) -> Rise:
         """Algorithm 1 on :class:`rise_agents.demonstrations.Demonstrations`; see :class:`rise_agents.agent.Agent`."""
         import torch  # here and not above: it takes a second, which who only acts need not spend

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -31,6 +32,19 @@ def test_stable_baselines_evaluates_it(subjects, name):
     env = DummyVecEnv([lambda: Monitor(gym.make(VEHICLE))] * 2)
     mean, _ = evaluate_policy(subjects[name].agent, env, n_eval_episodes=2)
     assert np.isfinite(mean)
+
+
+@pytest.mark.parametrize("name", AGENTS)
+def test_it_trains_in_one_thread_and_gives_the_others_back(subjects, name):
+    seen, before = set(), torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        subjects[name].fresh().learn(
+            subjects[name].source, progress=lambda *_: seen.add(torch.get_num_threads())
+        )
+        assert seen == {1} and torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)
 
 
 @pytest.mark.parametrize("name", AGENTS)

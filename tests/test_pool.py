@@ -36,6 +36,13 @@ def _sleep(tell, path):
     time.sleep(60)
 
 
+def _threads(tell):
+    import numba
+    import torch
+
+    return torch.get_num_threads(), numba.get_num_threads()
+
+
 def everything(pool: Pool, count: int) -> dict:
     ended = {}
     while len(ended) < count:
@@ -57,6 +64,15 @@ def test_results_errors_deaths_and_what_tasks_tell():
     assert ended["b"].died == "SIGKILL"
     assert ended["c"].error == "KeyError: 'nothing here'" and "_fail" in ended["c"].trace
     assert told == [("a", ("half", 3)), ("d", ("half", 4))]
+
+
+def test_a_worker_keeps_to_one_thread(monkeypatch):
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
+        monkeypatch.delenv(name, raising=False)
+    with Pool(1) as pool:
+        pool.start("a", _threads)
+        ended = everything(pool, 1)["a"]
+    assert ended.result == (1, 1)
 
 
 def test_a_signal_without_a_name_is_numbered():

@@ -42,6 +42,7 @@ from rise_agents.forward import Forward, layers_of, standardised
 from rise_agents.readings import checked_batch
 from rise_agents.resume import Resume
 from rise_agents.search import EVERYWHERE, Choice, Space
+from rise_agents.workers import one_thread
 
 Array = NDArray[np.float64]
 
@@ -118,6 +119,7 @@ class RiseBelief:
         self.scale = np.asarray(self.task.noise_scale[: 2 * self.task.dim + 1])
         self._arrays: dict[str, NDArray] = {}
 
+    @one_thread()
     def learn(
         self, source: Any, progress: Progress = silent, resume: Resume | StrPath | None = None
     ) -> RiseBelief:
