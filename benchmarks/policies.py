@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 
 from benchmarks.labels import split_row
@@ -15,20 +16,29 @@ from rise_agents.cloning import ActionUnits
 from rise_agents.experts import make_expert
 from rise_agents.filters import FILTERS, make_filter
 from rise_agents.readings import checked_parts, observation_ranks
+from rise_agents.vec_env import action_bounds
 from rise_envs import streams
 from rise_envs.task import env_class
 
 
 class Random:
-    """Uniform actions within the bounds."""
+    """Uniform actions: within the bounds, or any of a number.
+
+    Raises:
+        ValueError: actions that are neither a bounded box nor discrete, or observations that are no numbers.
+    """
 
     evaluate_deterministic = False
 
     def __init__(self, env_id: str) -> None:
-        self.units, self.ranks = (
-            ActionUnits.of(env_id),
-            observation_ranks(env_class(env_id)().observation_space),
-        )
+        env = env_class(env_id)()
+        self.space, self.ranks = env.action_space, observation_ranks(env.observation_space)
+        env.close()
+        bounds = action_bounds(self.space)
+        if bounds is None and not isinstance(self.space, spaces.Discrete):
+            raise ValueError(f"chance plays boxes and discrete actions, those of {env_id} are {self.space}")
+        self.units = None if bounds is None else ActionUnits(*bounds)
+        self.size = 1 if self.units is None else self.units.size
 
     def initial_state(self, keys: NDArray[np.uint64]) -> State:
         """Streams for episodes with the given keys (B,)."""
@@ -36,15 +46,20 @@ class Random:
 
     def predict(
         self, observation: Any, state: State = None, episode_start: Any = None, deterministic: bool = False
-    ) -> tuple[NDArray[np.float32], State]:
+    ) -> tuple[NDArray, State]:
         """Actions (B, A), or (A,) for one observation."""
         parts, single = checked_parts(observation, self.ranks)
         rows = len(next(iter(parts.values())))
         keys, counter = draw_state(state, episode_start, rows, np.random.default_rng(0))
-        size = len(self.units.low)
-        draws = counter[:, None] * np.uint64(size) + np.arange(size, dtype=np.uint64)
-        action = self.units.to_action(2 * streams.uniform(keys[:, None], draws) - 1)
+        draws = counter[:, None] * np.uint64(self.size) + np.arange(self.size, dtype=np.uint64)
+        action = self._actions(streams.uniform(keys[:, None], draws))
         return (action[0] if single else action), (keys, counter + np.uint64(1))
+
+    def _actions(self, share: NDArray[np.float64]) -> NDArray:
+        """Actions (B, A), or (B,) where they are discrete, of draws (B, A) in [0, 1)."""
+        if self.units is None:
+            return self.space.start + (share[:, 0] * self.space.n).astype(np.int64)
+        return self.units.to_action(2 * share - 1)
 
 
 def make_policy(

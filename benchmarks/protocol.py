@@ -22,7 +22,7 @@ from rise_agents import AGENTS, agent_class, pretrained
 from rise_agents.agent import nearest
 from rise_agents.experts import EXPERTS, expert_names
 from rise_agents.filters import FILTERS
-from rise_agents.rollout import is_batched_env
+from rise_agents.rollout import check_judged, is_batched_env
 from rise_agents.seeds import RUNS, episode_seeds
 from rise_envs import ENVS
 from rise_envs.noise import make_noise
@@ -296,7 +296,8 @@ def make_plan(preset: str, settings: Settings, config_files: Sequence[Path] = ()
         **chosen: other fields of :class:`Plan`; None: as in the preset.
 
     Raises:
-        ValueError: see :class:`Plan`; an unknown preset; or a config file that is none.
+        ValueError: see :class:`Plan`; an unknown preset; a config file that is none; or an environment whose episodes
+            cannot be judged, which else would show when all is trained.
     """
     if preset not in PRESETS:
         raise ValueError(f"unknown preset {preset!r}: {nearest(preset, PRESETS)}")
@@ -316,7 +317,11 @@ def make_plan(preset: str, settings: Settings, config_files: Sequence[Path] = ()
     merged = configs.laid_over([brief, *read.layers, settings])
     variants = {name: variant for name, variant in read.variants.items() if name in named}
     kept = {name: each for name, each in merged.items() if name.partition("@")[0] in (*AGENTS, *variants)}
-    return Plan(**values, settings=kept, variants=variants)
+    plan = Plan(**values, settings=kept, variants=variants)
+    for env in plan.envs:
+        if not describes_task(env):  # who does, is ours or has been through the contract tests
+            check_judged(env)
+    return plan
 
 
 def _brief(rows: Iterable[str], variants: Mapping[str, Variant]) -> Settings:

@@ -95,9 +95,8 @@ class Run:
         except (LookupError, TypeError, ValueError, AttributeError):
             raise ValueError(f"{self.folder / RECORD} does not say how {name} acted in {env}") from None
         if agent not in AGENTS:
-            raise ValueError(
-                f"{self.folder / RECORD} names an unknown agent {agent!r}: {nearest(agent, AGENTS)}"
-            )
+            known = f"one of yours needs its --import; {nearest(agent, AGENTS)}"
+            raise ValueError(f"{self.folder / RECORD} names an unknown agent {agent!r}: {known}")
         acting = acting_settings(agent_class(agent))
         settings = {key: value for key, value in stored.items() if key in acting}
         try:

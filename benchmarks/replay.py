@@ -38,6 +38,7 @@ examples:
 def parser() -> Parser:
     """The command line."""
     p = Parser(
+        plugins=True,
         prog="python -m benchmarks.replay",
         description="Run a recorded episode again, check that it comes out as stored, say what happened, draw it.",
         epilog=_EXAMPLES,

@@ -15,7 +15,7 @@ from rise_agents import archive
 from rise_agents.agent import initial_state
 from rise_agents.rollout import policy_keys, rollout
 from rise_envs.noise_wrappers import ObservationNoise
-from rise_envs.task import env_class
+from rise_envs.task import metadata_of
 
 Array = NDArray[np.float64]
 Act = Callable[[Any], NDArray]  # from an observation to an action; called once a step, in order
@@ -126,7 +126,7 @@ def play(
 
 def draws(env_id: str) -> bool:
     """Whether an environment draws pictures."""
-    return "rgb_array" in env_class(env_id).metadata["render_modes"]
+    return "rgb_array" in metadata_of(env_id)["render_modes"]
 
 
 def _parts(observation: Any) -> tuple[NDArray, NDArray, NDArray]:

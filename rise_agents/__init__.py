@@ -110,7 +110,8 @@ def load_agent(
     arrays, description = checkpoint.load(path)
     name, own = description.get("agent"), description["env"]
     if not isinstance(name, str) or name not in AGENTS:
-        raise checkpoint.CheckpointError(path, f"holds an unknown agent {name!r}", "update the package")
+        remedy = "import the module that registers it first (--import), or update the package"
+        raise checkpoint.CheckpointError(path, f"holds an unknown agent {name!r}", remedy)
     if env is not None and own != env:
         raise checkpoint.CheckpointError(
             path, f"was trained on {own!r}, not {env!r}", "train on that environment"

@@ -102,7 +102,7 @@ def _check_env(path: StrPath, description: dict[str, Any]) -> None:
     env = description.get("env")
     # Looked up, not handed to Gymnasium, which would import the module that an id "module:name" names.
     if not isinstance(env, str) or env not in gym.registry:
-        remedy = "import the package that registers it first"
+        remedy = "import the module that registers it first (--import)"
         raise CheckpointError(path, f"was trained on {env!r}, which is not registered", remedy)
     stored, here = description.get("spaces"), spaces_digest(env)
     if stored != here:

@@ -61,7 +61,8 @@ class CPPO:
         device: a torch device for training; ``predict`` runs in NumPy.
 
     Raises:
-        ValueError: an unknown setting, one out of range, or a frame that the environment does not offer.
+        ValueError: an environment that is not registered, an unknown setting, one out of range, or a frame that the
+            environment does not offer.
     """
 
     name = "cppo"
@@ -107,8 +108,10 @@ class CPPO:
     ) -> None:
         self.env_id, self.seed, self.device = env_id, seed, device
         self.config = make_config(type(self), env_id, config or {})
+        _check_known("env_id", env_id)
+        if self.config.train_env:
+            _check_known("train_env", self.config.train_env)
         self._task = self._describe()
-        _check_known(self.config.train_env)
         self._rng = np.random.default_rng(seed)
         self._arrays: dict[str, NDArray] = {}  # what training left behind, in the form that is stored
         self._notes: dict[str, Any] = {}
@@ -335,13 +338,15 @@ class CPPO:
             require(bool((low < high).all()), "action.low must lie below action.high", (low, high))
 
 
-def _check_known(env_id: str) -> None:
-    """Raise ``ValueError`` if an environment to train in, where one is named, is not registered.
+def _check_known(what: str, env_id: str) -> None:
+    """Raise ``ValueError`` if an environment is not registered: no checkpoint could be stored, or loaded again.
 
     Looked up, not handed to Gymnasium, which would import the module that an id "module:name" names.
     """
-    if env_id and env_id not in gym.registry:
-        raise ValueError(f"train_env: no environment {env_id!r} is registered: {nearest(env_id, ENVS)}")
+    if env_id not in gym.registry:
+        raise ValueError(
+            f"{what}: no environment {env_id!r} is registered (gymnasium.register does so): {nearest(env_id, ENVS)}"
+        )
 
 
 def _linear(first: float, last: float) -> Callable[[float], float]:

@@ -26,7 +26,7 @@ from rise_agents.files import sole_user
 from rise_agents.seeds import episode_seeds
 from rise_envs import ENVS, ObservationNoise, make_noise
 from rise_envs.settings import finite, whole
-from rise_envs.task import env_class, task_of
+from rise_envs.task import env_class, metadata_of, task_of
 
 PERSON = "person"
 # Which keys push each action to its upper and to its lower bound, where the environment's class has no ``KEYS``.
@@ -84,6 +84,7 @@ class Keyboard:
         names = getattr(env_class(env_id), "KEYS", KEYS)
         if len(names) < space.shape[0]:
             raise ValueError(f"{env_id} has {space.shape[0]} actions, and keys for {len(names)}")
+        self.names = [name for pair in names[: space.shape[0]] for name in pair]
         self.pairs = [[pygame.key.key_code(name) for name in pair] for pair in names[: space.shape[0]]]
         self.low, self.high = space.low, space.high
         self.held: set[int] = set()
@@ -260,11 +261,11 @@ def checked(argv: Sequence[str] | None) -> argparse.Namespace:
     a = parser().parse_args(argv)
     if a.env not in ENVS:
         raise ValueError(f"unknown environment {a.env!r}: {nearest(a.env, ENVS)}")
-    kind = env_class(a.env)
-    if "rgb_array" not in kind.metadata["render_modes"]:
+    metadata = metadata_of(a.env)
+    if "rgb_array" not in metadata["render_modes"]:
         raise ValueError(f"{a.env} draws no pictures: there is nothing to drive by")
     make_noise(a.noise_model, a.noise_level, task_of(a.env).noise_channels)
-    a.rate = finite("--rate", kind.metadata.get("render_fps", 10) if a.rate is None else a.rate, 0.0)
+    a.rate = finite("--rate", metadata.get("render_fps", 10) if a.rate is None else a.rate, 0.0)
     if a.episodes is not None:
         whole("--episodes", a.episodes, 1)
     episode_seeds("train", a.seed, 0, 1)  # raises where there is no such range
@@ -292,6 +293,7 @@ def there_already(a: argparse.Namespace) -> tuple[list[Drive], int]:
 def play(a: argparse.Namespace, kept: list[Drive], tried: int) -> list[Drive]:
     """Let somebody drive; what is driven well is added to ``kept`` and, if a folder is named, stored at once."""
     seat = Seat(a.env, a.noise_model, a.noise_level, a.rate)
+    print(f"drive with {', '.join(seat.keyboard.names)}; r: another episode; q: end")
     number, last = tried, None if a.episodes is None else tried + a.episodes
     try:
         while seat.taken and number != last:

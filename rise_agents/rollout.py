@@ -157,11 +157,24 @@ def rollout(
     return tally.episodes(), log.transitions(total)
 
 
+def check_judged(env_id: str) -> None:
+    """Raise ``ValueError`` unless an environment can be stepped, and says all that episodes are judged by."""
+    try:
+        env = gym.make(env_id)
+        env.reset(seed=0)
+        env.action_space.seed(0)
+        infos = env.step(env.action_space.sample())[-1]
+        env.close()
+    except Exception as error:  # whatever an environment of somebody else raises
+        reason = (str(error).strip() or "no message").splitlines()[0]
+        raise ValueError(f"{env_id} fails in its first step: {type(error).__name__}: {reason}") from error
+    _check_infos(env_id, infos)
+
+
 def _check_infos(env_id: str, infos: dict[str, Any]) -> None:
-    """Raise ``ValueError`` unless the infos of a step say all that episodes are judged by."""
-    for name in ("cost", "clearance", "is_success"):
-        if name not in infos:
-            raise ValueError(f"{env_id} gives no info[{name!r}], by which episodes are judged")
+    missing = [f"info[{name!r}]" for name in ("cost", "clearance", "is_success") if name not in infos]
+    if missing:
+        raise ValueError(f"{env_id} gives no {', no '.join(missing)}, by which episodes are judged")
 
 
 class _Tally:

@@ -103,6 +103,16 @@ def env_class(env_id: str) -> Any:
     return entry
 
 
+def metadata_of(env_id: str) -> dict[str, Any]:
+    """The ``metadata`` of a registered environment: its class's, or where that has none, as a wrapper's, its own."""
+    metadata = env_class(env_id).metadata
+    if isinstance(metadata, dict):
+        return metadata
+    env = gym.make(env_id)
+    env.close()
+    return env.metadata
+
+
 def describes_task(env_id: str) -> bool:
     """Whether a registered environment publishes a task description: without one, only its numbers are known."""
     return hasattr(env_class(env_id), "task")

@@ -254,6 +254,12 @@ def test_it_trains_where_it_is_told_to(monkeypatch, source, train_env, used):
     assert asked == [(used, 4)] and agent.env_id == VEHICLE
 
 
+def test_what_could_not_be_stored_is_not_trained():
+    for env_id in ("Nowhere-v0", "json:Nowhere-v0"):
+        with pytest.raises(ValueError, match=rf"env_id: no environment '{env_id}' is registered"):
+            make_agent("cppo", env_id, TOY)
+
+
 def test_frames_need_a_task():
     with pytest.raises(ValueError, match="raw"):
         make_agent("cppo", "CartPole-v1")

@@ -185,6 +185,30 @@ def exported(vehicle_demonstrations, tmp_path, monkeypatch):
     return tmp_path / "rise" / "vehicle-v0" / "data"
 
 
+def test_a_minari_set_of_something_else_is_named(tmp_path, monkeypatch):
+    import minari
+    from minari.data_collector import EpisodeBuffer
+
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    episode = EpisodeBuffer(
+        **{"observations": np.zeros((3, 3), np.float32), "actions": np.zeros((2, 1), np.float32)},
+        **{"rewards": [0.0, 0.0], "terminations": [False, True], "truncations": [False, False]},
+    )
+    about = dict.fromkeys(("algorithm_name", "author", "author_email", "code_permalink", "description"), "me")
+    about |= dict.fromkeys(("env", "eval_env"), "Pendulum-v1")
+    minari.create_dataset_from_buffers("lab/array-v0", [episode], **about)
+    with pytest.raises(DatasetError, match=r"'lab/array-v0': observations have no .*: they must be dicts of"):
+        minari_io.load("lab/array-v0", VEHICLE)
+    with pytest.raises(ValueError, match="'CartPole-v1' describes no task"):
+        minari_io.load("lab/array-v0", "CartPole-v1")
+
+
+def test_a_set_has_episodes():
+    for number in (0, -1, 2.0):
+        with pytest.raises(ValueError, match="episodes must be a whole number ≥ 1"):
+            generate(VEHICLE, "cbf", episodes=number)
+
+
 def test_a_changed_number_in_a_minari_set_is_noticed(exported):
     h5py = pytest.importorskip("h5py")
     with h5py.File(exported / "main_data.hdf5", "r+") as file:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import re
 import shlex
@@ -13,13 +14,15 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+import toy_envs
 
 import rise_agents
 import rise_envs
-from benchmarks import publish, report
+from benchmarks import cli, report
 from benchmarks import run as benchmark
+from benchmarks.policies import Random
 from benchmarks.results import read_rows
-from benchmarks.tune import __main__ as tune
+from benchmarks.trajectories import draws
 from rise_agents import AGENTS, make_agent, play, register_agent
 from rise_agents.demonstrations import __main__ as demonstrations
 from rise_agents.demonstrations import generate
@@ -27,8 +30,7 @@ from rise_agents.experts import make_expert, register_expert
 from rise_agents.filters import FILTERS, make_filter, register_filter
 from rise_agents.plugins import import_modules, imported
 from rise_agents.pool import Pool
-from rise_agents.pretrained import __main__ as pretrained
-from rise_agents.rollout import rollout
+from rise_agents.rollout import check_judged, rollout
 from rise_agents.seeds import episode_seeds
 from rise_agents.testing import check_agent
 from rise_envs import register_env, register_noise
@@ -274,32 +276,25 @@ def test_a_class_that_breaks_the_contract_is_told(vehicle_demonstrations):
 
 # --- --import --------------------------------------------------------------------------------------------------
 
-PROGRAMS = {
-    "benchmarks.run": benchmark,
-    "benchmarks.tune": tune,
-    "benchmarks.report": report,
-    "benchmarks.publish": publish,
-    "rise_agents.demonstrations": demonstrations,
-    "rise_agents.pretrained": pretrained,
-    "rise_agents.play": play,
-}
+OF_OURS_ALONE = {"upload", "speed", "fidelity", "faults"}
 
 
-@pytest.mark.parametrize("name", PROGRAMS)
+@pytest.mark.parametrize("name", sorted(cli.COMMANDS.keys() - OF_OURS_ALONE))
 def test_every_command_that_looks_names_up_imports(name, tmp_path, capsys):
-    required = {"rise_agents.demonstrations": ["--env", "x", "--out", str(tmp_path)]}.get(name, [])
-    first = VEHICLE if name == "rise_agents.play" else str(tmp_path)
-    positional = [] if required or name in ("benchmarks.run", "benchmarks.tune") else [first]
+    program = importlib.import_module(cli.COMMANDS[name].module)
+    needed = [
+        word
+        for action in program.parser()._actions
+        if action.required
+        for word in (*action.option_strings[:1], str(tmp_path))
+    ]
     module = str(EXAMPLES / "neighbours.py")
-    PROGRAMS[name].parser().parse_args([*positional, *required, "--import", module, "--import", "json"])
+    program.parser().parse_args([*needed, "--import", module, "--import", "json"])
     assert "neighbours" in AGENTS
     assert imported() == (module, "json")
-    assert PROGRAMS[name].main([*positional, *required, "--import", "no_such_module"]) == 2
+    assert program.main([*needed, "--import", "no_such_module"]) == 2
     error = capsys.readouterr().err
-    assert (
-        error.startswith(f"{name}: --import no_such_module: there is no such module")
-        and error.count("\n") == 1
-    )
+    assert ": --import no_such_module: there is no such module" in error and error.count("\n") == 1
 
 
 @pytest.mark.parametrize(
@@ -425,15 +420,63 @@ def test_what_an_environment_of_one_s_own_does_not_offer(arguments, message, tmp
     assert re.search(message, error) and error.count("\n") == 1
 
 
-def test_an_environment_whose_infos_say_too_little(tmp_path):
-    with pytest.raises(ValueError, match=r"ToyWalk-v0 gives no info\['clearance'\]"):
-        import toy_envs  # noqa: F401  registers it
+class Broken(toy_envs.Walk):
+    def step(self, action):
+        raise LookupError("no wheels")
 
-        class Still:
-            def predict(self, observation, state=None, episode_start=None, deterministic=True):
-                return np.zeros((len(observation), 2)), None
 
-        rollout(Still(), "ToyWalk-v0", [0])
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        (toy_envs.Walk, r"Mine-v0 gives no info\['clearance'\], no info\['is_success'\]"),
+        (Broken, r"Mine-v0 fails in its first step: LookupError: no wheels"),
+    ],
+)
+def test_an_environment_whose_episodes_cannot_be_judged_is_refused_at_once(kind, message, tmp_path, capsys):
+    register_env("Mine-v0", kind, 20)
+    with pytest.raises(ValueError, match=message.partition(" fails")[0]):
+        check_judged("Mine-v0")
+    arguments = ["--envs", "Mine-v0", "--agents", "random", "--out", str(tmp_path)]
+    assert benchmark.main(arguments) == 2
+    error = capsys.readouterr().err
+    assert re.search(message, error) and error.count("\n") == 1
+
+
+class Wrapped(gym.Wrapper):
+    """What exists already, with what episodes are judged by."""
+
+    def __init__(self, render_mode=None):
+        super().__init__(gym.make("Pendulum-v1", render_mode=render_mode))
+
+    def step(self, action):
+        observation, reward, terminated, truncated, info = super().step(action)
+        info |= {"cost": 0.0, "clearance": 1.0, "is_success": False}
+        return observation, reward, terminated, truncated, info
+
+
+def test_a_wrapper_is_an_environment_of_one_s_own():
+    register_env("Mine-v0", Wrapped, 20)
+    check_env("Mine-v0", episodes=2)
+    assert draws("Mine-v0")
+    check_judged("Mine-v0")
+
+
+class Lever(toy_envs.Lever):
+    action_space = gym.spaces.Discrete(3, start=5)
+
+    def step(self, action):
+        *rest, info = super().step(action)
+        return *rest, {**info, "clearance": float(action), "is_success": True}
+
+
+def test_chance_plays_discrete_actions():
+    register_env("Mine-v0", Lever, 20)
+    policy = Random("Mine-v0")
+    episodes, _ = rollout(policy, "Mine-v0", range(300), deterministic=False)
+    values, counts = np.unique(episodes.min_clearance, return_counts=True)
+    assert values.tolist() == [5, 6, 7] and (counts > 60).all()
+    again, _ = rollout(policy, "Mine-v0", range(300), deterministic=False, slots=7)
+    np.testing.assert_array_equal(again.min_clearance, episodes.min_clearance)
 
 
 # --- the page --------------------------------------------------------------------------------------------------

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import runpy
+
 import gymnasium as gym
 import numpy as np
 import pygame
@@ -100,7 +102,8 @@ def test_what_is_driven_well_is_kept(person, tmp_path, capsys):
     out = tmp_path / "mine"
     arguments = [VEHICLE, "--rate", "0", "--out", str(out)]
     assert main([*arguments, "--episodes", "3"]) == 0
-    said = capsys.readouterr().out.splitlines()
+    keys, *said = capsys.readouterr().out.splitlines()
+    assert keys == "drive with up, down, left, right; r: another episode; q: end"
     outcomes = [line.partition(": ")[2].partition(" after")[0] for line in said[:3]]
     good = [i for i, outcome in enumerate(outcomes) if outcome == "goal reached"]
     assert 0 < len(good) < 4 and said[-1] == f"{len(good)} good episodes in {out}"
@@ -159,7 +162,7 @@ def test_keys_that_end_and_begin_anew(person, capsys):
 
     person.presses = staticmethod(presses)
     assert main([VEHICLE, "--rate", "0"]) == 0
-    assert capsys.readouterr().out == ""
+    assert capsys.readouterr().out.count("\n") == 1  # which keys drive
     assert next(keys, None) is None
 
 
@@ -180,7 +183,8 @@ def test_the_arm_can_be_driven(person, capsys):
 
     person.presses = staticmethod(presses)
     assert main(["RISE-SafePanda-v0", "--rate", "0", "--episodes", "1"]) == 0
-    assert capsys.readouterr().out.startswith("episode 1: ")
+    keys, ended = capsys.readouterr().out.splitlines()
+    assert keys.startswith("drive with down, up, right, left, w, s;") and ended.startswith("episode 1: ")
 
 
 def test_an_interruption_is_told_by_the_exit_code(person):
@@ -231,3 +235,8 @@ def test_the_keys_of_the_arm_are_as_the_camera_sees_it():
             moved = hand + 0.05 * sign * np.eye(3)[axis]
             shift = camera().project(moved)[0] - camera().project(hand)[0]
             assert shift @ towards[key] > 0.5 * np.abs(shift).max()
+
+
+def test_who_looks_for_it_among_the_environments_is_told():
+    with pytest.raises(SystemExit, match=r"python -m rise_agents\.play"):
+        runpy.run_module("rise_envs.play", run_name="__main__")

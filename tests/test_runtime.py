@@ -535,6 +535,28 @@ def test_the_command_runs_keeps_and_replays(agent, tmp_path, capsys):
     assert "  go" in told and "differ by 0.0e+00" in told
 
 
+def test_a_run_that_cannot_be_kept_is_told(agent, tmp_path, capsys):
+    agent.save(tmp_path / "agent.rise")
+    (tmp_path / "run.parquet").mkdir()
+    arguments = ["--agent", str(tmp_path / "agent.rise"), "--env", VEHICLE, "--seconds", "0.2"]
+    assert main([*arguments, "--log", str(tmp_path / "run.parquet")]) == 1
+    told = capsys.readouterr().err
+    assert told.startswith("rise_agents.runtime: ") and "run.parquet" in told and told.count("\n") == 1
+
+
+def test_a_robot_that_fails_is_told_and_the_run_is_kept(agent, tmp_path, capsys, monkeypatch):
+    def broken(self):
+        raise OSError("no answer from the drive")
+
+    monkeypatch.setattr(EnvRobot, "observe", broken)
+    agent.save(tmp_path / "agent.rise")
+    arguments = ["--agent", str(tmp_path / "agent.rise"), "--env", VEHICLE, "--seconds", "0.2"]
+    assert main([*arguments, "--log", str(tmp_path / "run.parquet")]) == 1
+    told = capsys.readouterr().err
+    assert told.startswith("rise_agents.runtime: ") and "no answer from the drive" in told
+    assert len(log.read(tmp_path / "run.parquet")) == 0
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
@@ -544,7 +566,7 @@ def test_the_command_runs_keeps_and_replays(agent, tmp_path, capsys):
         (["--env", PANDA], "was trained on"),
         (["--seconds", "0"], "--seconds"),
         (["--rate", "nan"], "--rate"),
-        (["--noise", "stp"], "unknown noise model"),
+        (["--noise-model", "stp"], "unknown noise model"),
         (["--noise-level", "-1"], "noise_level"),
         (["--stale-after", "0.5"], "stale_after"),
         (["--rate-limit", "1"], "rate must hold 2 numbers"),

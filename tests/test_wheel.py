@@ -42,8 +42,9 @@ def test_a_wheel_holds_all_that_the_packages_hold(tmp_path):
 
 
 @pytest.mark.slow
-def test_in_an_empty_environment_it_installs_and_runs_the_benchmark(tmp_path):
+def test_in_an_empty_environment_it_installs_and_runs_the_benchmark(tmp_path, monkeypatch):
     wheel = build(tmp_path / "built")
+    monkeypatch.delenv("PYTHONPATH", raising=False)  # else it may be the sources that run
     venv.create(tmp_path / "venv", with_pip=True)
     run = tmp_path / "venv" / "bin"
     pip = [run / "python", "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]

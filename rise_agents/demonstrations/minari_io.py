@@ -14,7 +14,7 @@ from rise_agents.demonstrations.dataset import (
     Demonstrations,
     from_arrays,
 )
-from rise_envs.task import env_class
+from rise_envs.task import env_class, task_of
 
 _SEED, _EXPERT, _DIGEST = "rise_seed", "rise_expert", "rise_sha256"
 
@@ -98,8 +98,10 @@ def load(dataset_id: str, env_id: str) -> Demonstrations:
     used, since building it would run what it says.
 
     Raises:
+        ValueError: an environment that describes no task.
         DatasetError: no such dataset, damaged since :func:`export`, or not safe episodes of that environment.
     """
+    task_of(env_id)
     try:
         metadata, episodes = _read(dataset_id)
         demonstrations = from_arrays(env_id, _arrays(episodes), _card(dataset_id, episodes))
@@ -149,6 +151,10 @@ def _arrays(episodes: list[Any]) -> dict[str, Any]:
         "expert": info(_EXPERT, 0).astype(np.int64),
     }
     for key in OBSERVATIONS:
+        if not all(isinstance(e.observations, dict) and key in e.observations for e in episodes):
+            raise DatasetError(
+                f"observations have no {key!r}: they must be dicts of {', '.join(OBSERVATIONS)}"
+            )
         arrays[f"observations.{key}"] = np.concatenate([e.observations[key][:-1] for e in episodes])
         arrays[f"final.{key}"] = np.stack([e.observations[key][-1] for e in episodes])
     return arrays

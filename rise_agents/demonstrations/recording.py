@@ -19,6 +19,7 @@ from rise_agents.experts import make_expert
 from rise_agents.pool import Pool, TaskError
 from rise_agents.rollout import Transitions, policy_keys, rollout
 from rise_agents.seeds import PER_RUN, episode_seeds
+from rise_envs.settings import whole
 
 CHUNK = 50  # candidate episodes per piece of work, at most
 KIND = "candidates"
@@ -122,10 +123,11 @@ def generate(
             interrupted goes on where it was.
 
     Raises:
-        ValueError: an unknown expert, or one that fails so often that the seeds run out.
+        ValueError: an unknown expert, or one that fails so often that the seeds run out; no number of episodes.
         DatasetError: a piece in ``parts`` is damaged or of another recording.
         TaskError: a worker process died.
     """
+    whole("episodes", episodes, 1)
     make_expert(expert, env_id, seed=seed)  # an unknown name is told here, not in a worker
     done: list[Part] = []
     kept = tried = 0

@@ -22,6 +22,7 @@ examples:
 def parser() -> Parser:
     """The command line."""
     p = Parser(
+        plugins=True,
         prog="python -m rise_agents.export",
         description="Turn a trained agent into one file that runs without Python, and check that it acts the same.",
         epilog=_EXAMPLES,

@@ -13,7 +13,7 @@ import numpy as np
 
 from rise_agents.agent import nearest
 from rise_agents.checkpoint import CheckpointError
-from rise_agents.cli import Parser, prepare_folder
+from rise_agents.cli import Parser, WorkFailed, at_work, command, prepare_folder
 from rise_agents.runtime import log
 from rise_agents.runtime.loop import ControlLoop, Mind, Monotonic
 from rise_agents.runtime.policies import load_policy, warm_up
@@ -31,7 +31,7 @@ from rise_envs.task import env_class, task_of
 _EXAMPLES = """\
 examples:
   python -m rise_agents.runtime --agent agent.rise --env RISE-SafePanda-v0 --seconds 60
-  python -m rise_agents.runtime --agent agent.onnx --env RISE-GroundVehicle-v0 --noise step+dropout:0.2
+  python -m rise_agents.runtime --agent agent.onnx --env RISE-GroundVehicle-v0 --noise-model step+dropout:0.2
   python -m rise_agents.runtime --agent agent.rise --env RISE-SafePanda-v0 --udp 5005 --noise-level 0 &
   python -m rise_agents.runtime.send --env RISE-SafePanda-v0 --to 127.0.0.1:5005 --seconds 60
 """
@@ -40,6 +40,7 @@ examples:
 def parser() -> Parser:
     """The command line."""
     p = Parser(
+        plugins=True,
         prog="python -m rise_agents.runtime",
         description="Let a trained agent control a simulated robot in real time, past a virtual obstacle.",
         epilog=_EXAMPLES,
@@ -49,7 +50,7 @@ def parser() -> Parser:
     p.add_argument("--seconds", type=float, default=60.0, metavar="S", help="how long (default: 60)")
     p.add_argument("--rate", type=float, metavar="HZ", help="periods a second (default: the task's own)")
     p.add_argument("--seed", type=int, default=0, metavar="N", help="of episodes, noise, draws (default: 0)")
-    p.add_argument("--noise", default="step", metavar="MODEL", help="of the readings (default: step)")
+    p.add_argument("--noise-model", default="step", metavar="MODEL", help="of the readings (default: step)")
     p.add_argument("--noise-level", type=float, default=1.0, metavar="X", help="multiplies it (default: 1)")
     p.add_argument(
         "--udp", metavar="[HOST:]PORT", help="goal and obstacles come as datagrams (HOST: loopback)"
@@ -80,7 +81,7 @@ def _checked(a: Any) -> tuple[Rules, Limits, float]:
     finite("--seconds", a.seconds, 1e-3)
     finite("--spin", a.spin, 0.0, 1e3)
     period = task.dt if a.rate is None else 1.0 / finite("--rate", a.rate, 1e-3, 1e4)
-    make_noise(a.noise, a.noise_level, task.noise_channels)
+    make_noise(a.noise_model, a.noise_level, task.noise_channels)
     env = env_class(a.env)()
     space = env.action_space
     env.close()
@@ -105,36 +106,30 @@ def _terminated_as_interrupted() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
+@command("rise_agents.runtime", bad_input=(CheckpointError, ImportError))
 def main(argv: Sequence[str] | None = None) -> int:
     """Control; returns the exit code: 0 done, 1 the robot or the disk failed, 2 bad arguments, 130 interrupted."""
+    a: Any = parser().parse_args(argv)
+    rules, limits, period = _checked(a)
+    policy, task, clock = load_policy(a.agent, a.env), task_of(a.env), Monotonic(1e-3 * a.spin)
     with ExitStack() as stack:
-        try:
-            a: Any = parser().parse_args(argv)
-            rules, limits, period = _checked(a)
-            policy, task, clock = load_policy(a.agent, a.env), task_of(a.env), Monotonic(1e-3 * a.spin)
-            udp = None
-            if a.udp is not None:
-                udp = stack.enter_context(_listening(a.udp, task, clock))
-            robot = EnvRobot(a.env, clock, a.seed, follow=udp)
-            stack.callback(robot.close)
-        except (ValueError, CheckpointError, ImportError) as error:
-            print(f"rise_agents.runtime: {error}", file=sys.stderr)
-            return 2
-        except KeyboardInterrupt:
-            return 130
+        udp = None if a.udp is None else stack.enter_context(_listening(a.udp, task, clock))
+        robot = EnvRobot(a.env, clock, a.seed, follow=udp)
+        stack.callback(robot.close)
         true: ReadingStream = RobotReadings(robot) if udp is None else udp
-        stream = NoisyStream(true, task, a.noise, a.noise_level, a.seed)
+        stream = NoisyStream(true, task, a.noise_model, a.noise_level, a.seed)
         warm_up(policy, task)
         mind = Mind(policy, a.seed)
         about = {
-            **{"agent": a.agent, "env": a.env, "seed": a.seed, "period": period, "noise": a.noise},
+            **{"agent": a.agent, "env": a.env, "seed": a.seed, "period": period, "noise": a.noise_model},
             **{"noise_level": a.noise_level, "udp": a.udp, "deterministic": mind.deterministic},
             **{"stale_after": rules.stale_after, "overruns": rules.overruns, "resume_after": a.resume_after},
             **{"rate_limit": a.rate_limit},
         }
         recorder = log.Recorder(task, len(limits.low), about)
         loop = ControlLoop(mind, robot, stream, task, limits, period, rules, clock, recorder)
-        return _run(loop, a, udp)
+        with at_work():
+            return _run(loop, a, udp)
 
 
 def _run(loop: ControlLoop, a: Any, udp: UdpStream | None) -> int:
@@ -150,17 +145,12 @@ def _run(loop: ControlLoop, a: Any, udp: UdpStream | None) -> int:
     if udp is not None:
         counts = udp.receiver.counts
         print("datagrams   " + ", ".join(f"{counts[key]:,} {key}" for key in sorted(counts)))
+    if a.log is not None:
+        log.write(a.log, found)
+        print(f"kept in     {a.log}")
     stopped = loop.watchdog.stopped
     if stopped is not None and stopped.kind == "robot":
-        print(f"rise_agents.runtime: {stopped}", file=sys.stderr)
-        code = 1
-    if a.log is not None:
-        try:
-            log.write(a.log, found)
-            print(f"kept in     {a.log}")
-        except OSError as error:
-            print(f"rise_agents.runtime: {a.log}: {error.strerror}", file=sys.stderr)
-            code = code or 1
+        raise WorkFailed(str(stopped))
     return code
 
 

@@ -25,6 +25,7 @@ examples:
 def parser() -> Parser:
     """The command line."""
     p = Parser(
+        plugins=True,
         prog="python -m rise_agents.runtime.replay",
         description="Tell what happened in a recorded run; with the agent, decide it all again.",
         epilog=_EXAMPLES,

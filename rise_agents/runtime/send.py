@@ -34,6 +34,7 @@ examples:
 def parser() -> Parser:
     """The command line."""
     p = Parser(
+        plugins=True,
         prog="python -m rise_agents.runtime.send",
         description="Send goal and obstacles of an environment, or of a recorded run, as UDP datagrams.",
         epilog=_EXAMPLES,

@@ -11,7 +11,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import RescaleAction
 
 import rise_envs
-from rise_envs.task import env_class
+from rise_envs.task import metadata_of
 from rise_envs.testing.subject import Subject, actions, assert_same, hold, record, record_batch, refused
 
 # Gymnasium would like actions in [−1, 1], where some tasks have them in SI units on purpose.
@@ -102,8 +102,7 @@ def ownership(s: Subject) -> None:
 
 def drawing(s: Subject) -> None:
     """Drawing changes no episode, and an unchanged scene is drawn alike."""
-    metadata = env_class(s.env_id).metadata
-    if "rgb_array" not in metadata["render_modes"]:
+    if "rgb_array" not in metadata_of(s.env_id)["render_modes"]:
         return
     env = s.make(render_mode="rgb_array")
     env.reset(seed=0)
