@@ -153,7 +153,7 @@ def _front_at(rows: Sequence[SummaryRow], agents: Sequence[str]) -> list[Chart]:
         "line": {"dash": "dot", "width": 1.5, "color": "#888888"},
         "hoverinfo": "skip",
     }
-    return [joined, *marks]
+    return [*marks, joined]
 
 
 def front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:

@@ -91,7 +91,7 @@ def write_page(summary: Sequence[SummaryRow], run: Mapping[str, Any], folder: Pa
         pictures=_pictures(out),
         explorer=bool(packed.tasks),
         selection=_selection(packed.tasks),
-        run_folder=shlex.quote(folder.as_posix()),
+        replayed=shlex.join([folder.as_posix(), *_imports(run)]),
         meaning=_html(_tied(report.meaning(summary))),
         sections=[
             {"title": section.title, "html": _html("\n\n".join(_tables(section.rows)))}
@@ -222,6 +222,19 @@ def _selection(tasks: Sequence[Mapping[str, Any]]) -> str:
         else ""
     )
     return f"{'; '.join(words)}.{lost}" if tasks else ""
+
+
+def _imports(run: Mapping[str, Any]) -> list[str]:
+    """The ``--import`` options of the command of a run: without them nobody knows its names."""
+    try:
+        words = shlex.split(run.get("command", ""))
+    except ValueError:
+        return []
+    option, found = "", []
+    for word in words:
+        option = word if word.startswith("-") else option
+        found += [word] * (option.partition("=")[0] == "--import")
+    return found
 
 
 def _repeat(run: Mapping[str, Any]) -> str:

@@ -148,7 +148,7 @@ def test_charts_have_the_numbers_of_the_table_and_are_such_that_plotly_takes_the
     assert (line["name"], line["x"], line["y"]) == ("PC-BC", [0, 1], [91.3, 81.3])
     levels = drawn[f"pareto-{VEHICLE}"]["choices"]
     assert list(levels) == ["noise level 1", "noise level 0", "all noise levels"]
-    best, *marks = levels["noise level 1"]
+    *marks, best = levels["noise level 1"]
     assert [(mark["name"], mark["x"], mark["y"]) for mark in marks] == [
         ("RISE", [85.9], [85.5]),
         ("PC-BC", [81.3], [71.2]),
@@ -311,6 +311,31 @@ def test_without_trajectories_the_page_says_so(tmp_path):
         text = write_page(SUMMARY, RUN | {"trajectories": names}, tmp_path, tmp_path).read_text()
         assert "There are none to watch here" in text and "--no-videos" in text
         assert 'id="player"' not in text
+
+
+@pytest.mark.parametrize(
+    ("options", "imports"),
+    [
+        ("--import a.py 'my b.py' --agents rise --import=c.py", " --import a.py 'my b.py' --import=c.py"),
+        ("--agents rise", ""),
+        ("--agents 'an open quote", ""),
+    ],
+)
+def test_episodes_are_replayed_from_this_folder_with_the_modules_of_the_run(
+    traced, tmp_path, options, imports
+):
+    folder, names, _ = traced
+    run = {"command": f"python -m benchmarks.run {options}", "trajectories": names}
+    tags = Tags(write_page(SUMMARY, run, folder, tmp_path).read_text()).tags
+    assert [each["data-run"] for _, each in tags if "data-run" in each] == [f"{folder}{imports}"]
+
+
+def test_an_environment_of_one_s_own_must_be_imported(tmp_path):
+    facts = {"env": "Mine-v0", "row": "rise", "noise_model": "step", "noise_level": 1.0, "differing": []}
+    facts |= {"why": ["drawn"], "low": [-1.0] * 2, "high": [1.0] * 2}
+    trajectories.save(tmp_path / "a.rise", {0: episode(VEHICLE, 5, 0)}, facts)
+    with pytest.raises(ValueError, match="no environment 'Mine-v0' is registered: --import the module"):
+        write_page(SUMMARY, RUN | {"trajectories": ["a.rise"]}, tmp_path, tmp_path)
 
 
 def test_names_are_words_and_no_markup(tmp_path):
