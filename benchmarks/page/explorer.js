@@ -129,8 +129,9 @@ class Explorer {
       if (current) line.setAttribute("aria-current", "true");
       else line.removeAttribute("aria-current");
       if (!current) continue;
-      const above = line.offsetTop - this.part("head").offsetHeight, below = line.offsetTop + line.offsetHeight;
-      list.scrollTop = Math.max(below - list.clientHeight, Math.min(above, list.scrollTop));
+      const view = list.getBoundingClientRect(), box = line.getBoundingClientRect();
+      const above = view.top + this.part("head").offsetHeight - box.top, below = box.bottom - view.bottom;
+      list.scrollTop += above > 0 ? -above : Math.max(below, 0);
     }
   }
 
