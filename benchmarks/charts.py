@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from benchmarks import plots
-from benchmarks.labels import agent_label, condition_label, env_label, interval, is_reference, percent
+from benchmarks.labels import agent_label, env_label, interval, is_reference, percent
 from benchmarks.plots import METRICS, Metric
 from benchmarks.tables import SummaryRow, headline_level
 
@@ -89,66 +89,71 @@ def curve(rows: Sequence[SummaryRow], metric: Metric) -> Chart:
 
 
 def pareto(rows: Sequence[SummaryRow]) -> Chart:
-    """Reach Rate against Safety Rate of one task under one noise model: a line per agent over the noise levels.
+    """Reach Rate against Safety Rate of one task under one noise model: at each noise level, and along all of them.
 
-    The level of the figures has large marks with intervals; a dashed line joins those of its agents that no other one
-    beats in both rates.
+    The level of the figures comes first: where all are drawn, those of good agents lie in a corner.
     """
-    agents = list(dict.fromkeys(row.agent for row in rows))
-    headline = headline_level(rows)
-    data = []
-    safety, reach = METRICS
-    for place, agent in enumerate(agents):
-        line = sorted((row for row in rows if row.agent == agent), key=lambda row: row.noise_level)
-        ends = {
-            f"error_{axis}": {
-                "type": "data",
-                "symmetric": False,
-                "array": [_up(metric.of(row)) if row.noise_level == headline else 0 for row in line],
-                "arrayminus": [_down(metric.of(row)) if row.noise_level == headline else 0 for row in line],
-                "thickness": 1,
-                "color": plots.colour(agents, agent),
-            }
-            for axis, metric in (("x", safety), ("y", reach))
-        }
-        style = _style(agents, agent, place)
-        style["marker"] = style["marker"] | {
-            "size": [13 if row.noise_level == headline else 6 for row in line]
-        }
-        style["line"] = style["line"] | {"width": 1}
-        data.append(
-            {
-                **style,
-                **ends,
-                "x": [_percent(row.safety_rate) for row in line],
-                "y": [_percent(row.reach_rate) for row in line],
-                "customdata": [
-                    f"noise level {row.noise_level:g}: "
-                    f"Safety {percent(row.safety_rate)} %, Reach {percent(row.reach_rate)} %"
-                    for row in line
-                ],
-                "hovertemplate": "%{customdata}",
-            }
-        )
-    best = front([(row.safety_rate, row.reach_rate) for row in rows if row.noise_level == headline])
-    data.append(
-        {
-            "type": "scatter",
-            "mode": "lines",
-            "name": f"best at level {headline:g}",
-            "x": [_percent(x) for x, _ in best],
-            "y": [_percent(y) for _, y in best],
-            "line": {"dash": "dot", "width": 1.5, "color": "#888888"},
-            "hoverinfo": "skip",
-        }
-    )
+    agents, headline = list(dict.fromkeys(row.agent for row in rows)), headline_level(rows)
+    levels = sorted({row.noise_level for row in rows})
+    choices = {
+        f"noise level {level:g}": _front_at([row for row in rows if row.noise_level == level], agents)
+        for level in sorted(levels, key=lambda level: (level != headline, level))
+    }
+    if len(levels) > 1:
+        lines = ([row for row in rows if row.agent == agent] for agent in agents)
+        choices["all noise levels"] = [_both_rates(line, agents) for line in lines]
     layout = {
         "xaxis": {"title": {"text": "Safety Rate"}, "ticksuffix": " %", "fixedrange": True},
         "yaxis": {"title": {"text": "Reach Rate"}, "ticksuffix": " %", "fixedrange": True},
         "hovermode": "closest",
     }
-    title = f"{env_label(rows[0].env)}: {condition_label(rows[0].noise_model, headline)} in large"
-    return _chart(title, _legend(layout), 400 + 20 * len(agents), data=data)
+    return _chart(env_label(rows[0].env), _legend(layout), 400 + 20 * len(agents), choices=choices)
+
+
+def _both_rates(rows: Sequence[SummaryRow], agents: Sequence[str]) -> Chart:
+    """The rates of one agent, from its lowest noise level to its highest."""
+    line, agent = sorted(rows, key=lambda row: row.noise_level), rows[0].agent
+    safety, reach = METRICS
+    return {
+        **_style(agents, agent, agents.index(agent)),
+        "x": [_percent(row.safety_rate) for row in line],
+        "y": [_percent(row.reach_rate) for row in line],
+        "customdata": [
+            f"noise level {row.noise_level:g}: Safety {_words(safety.of(row))}, Reach {_words(reach.of(row))}"
+            for row in line
+        ],
+        "hovertemplate": "%{customdata}",
+    }
+
+
+def _front_at(rows: Sequence[SummaryRow], agents: Sequence[str]) -> list[Chart]:
+    """A mark with both intervals per agent at one level, and a line that joins those that no other beats in both."""
+    marks = [
+        _both_rates([row], agents)
+        | {
+            f"error_{axis}": {
+                "type": "data",
+                "symmetric": False,
+                "array": [_up(metric.of(row))],
+                "arrayminus": [_down(metric.of(row))],
+                "thickness": 1,
+                "color": plots.colour(agents, row.agent),
+            }
+            for axis, metric in zip("xy", METRICS, strict=True)
+        }
+        for row in rows
+    ]
+    best = front([(row.safety_rate, row.reach_rate) for row in rows])
+    joined = {
+        "type": "scatter",
+        "mode": "lines",
+        "name": "no other is better in both",
+        "x": [_percent(x) for x, _ in best],
+        "y": [_percent(y) for _, y in best],
+        "line": {"dash": "dot", "width": 1.5, "color": "#888888"},
+        "hoverinfo": "skip",
+    }
+    return [*marks, joined]
 
 
 def front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
@@ -206,7 +211,8 @@ def _chart(title: str, layout: Chart, height: int, **traces: Any) -> Chart:
 
 def _legend(layout: Chart) -> Chart:
     """``layout`` with a legend below: beside the chart there is no room on a phone."""
-    return {"legend": {"orientation": "h", "y": -0.18, "yanchor": "top", "x": 0}, **layout}
+    below = {"orientation": "h", "yref": "container", "y": 0, "yanchor": "bottom", "x": 0}
+    return {"legend": below, **layout}
 
 
 def _style(agents: Sequence[str], agent: str, place: int) -> Chart:
@@ -217,7 +223,7 @@ def _style(agents: Sequence[str], agent: str, place: int) -> Chart:
         "mode": "lines+markers",
         "name": agent_label(agent),
         "line": {"color": paint, "width": 2, "dash": "dash" if is_reference(agent) else "solid"},
-        "marker": {"color": paint, "symbol": _SYMBOLS[place % len(_SYMBOLS)], "size": 8},
+        "marker": {"color": paint, "symbol": _SYMBOLS[place % len(_SYMBOLS)], "size": 9},
     }
 
 

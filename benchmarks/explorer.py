@@ -21,7 +21,7 @@ from benchmarks.jobs import Job, actor_of, evaluated
 from benchmarks.labels import agent_label, env_label, is_reference, noise_label
 from benchmarks.policies import make_policy
 from benchmarks.protocol import Plan, digest
-from benchmarks.recorded import recreated
+from benchmarks.recorded import recreated, require_registered
 from benchmarks.trajectories import Trajectory
 from rise_agents.agent import Progress
 from rise_envs.task import Task, describes_task, task_of
@@ -152,7 +152,7 @@ def pack(files: Sequence[Path], rows: Sequence[str] = ()) -> Packed:
         rows: in which order agents stand.
 
     Raises:
-        ValueError: a file is damaged.
+        ValueError: a file is damaged, or nobody has registered its environment.
     """
     packed = Packed()
     loaded = [trajectories.load(path) for path in files]
@@ -169,6 +169,7 @@ def _packed_task(
     env: str, loaded: Sequence[tuple[dict[int, Trajectory], dict[str, Any]]], numbers: bytearray
 ) -> dict[str, Any]:
     """The description of a task and its episodes, whose numbers are added to ``numbers``."""
+    require_registered(env)
     task, first = task_of(env), loaded[0][1]
     agents = list(dict.fromkeys(facts["row"] for _, facts in loaded))
     why = {n: kind for found, facts in loaded for n, kind in zip(found, facts["why"], strict=True)}

@@ -10,6 +10,8 @@ from __future__ import annotations
 import base64
 import gzip
 import json
+import re
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
@@ -72,7 +74,7 @@ def write_page(summary: Sequence[SummaryRow], run: Mapping[str, Any], folder: Pa
         ValueError: an empty summary, or a damaged file of trajectories.
         OSError: it cannot be written.
     """
-    asked, *_ = sections(summary, run.get("blocks", ()))
+    asked, *others = sections(summary, run.get("blocks", ()))
     traced = [folder / name for name in run.get("trajectories", ())]
     traced = [path for path in traced if path.exists()]
     packed = explorer.pack(traced, run.get("rows", ()))
@@ -84,16 +86,16 @@ def write_page(summary: Sequence[SummaryRow], run: Mapping[str, Any], folder: Pa
         title="Safety and reach under noisy obstacle readings",
         version=__version__,
         style=_asset("style.css"),
-        findings=_html("\n\n".join(report.claims(asked.rows))),
+        findings=_html(_tied("\n\n".join(_findings(asked.rows, run)))),
         groups=groups,
         pictures=_pictures(out),
         explorer=bool(packed.tasks),
         selection=_selection(packed.tasks),
-        run_folder=_command_path(folder),
-        meaning=_html(report.meaning(summary)),
+        replayed=shlex.join([folder.as_posix(), *_imports(run)]),
+        meaning=_html(_tied(report.meaning(summary))),
         sections=[
-            {"title": section.title, "html": _html("\n\n".join(report.tables_markdown(section.rows)))}
-            for section in sections(summary, run.get("blocks", ()))
+            {"title": section.title, "html": _html("\n\n".join(_tables(section.rows)))}
+            for section in (asked, *others)
         ],
         training={"charts": trainings, "facts": _html(report.training_markdown(run))}
         if run.get("training")
@@ -116,17 +118,40 @@ def write_page(summary: Sequence[SummaryRow], run: Mapping[str, Any], folder: Pa
     return out / PAGE
 
 
+def _by_model(summary: Sequence[SummaryRow]) -> dict[str, list[SummaryRow]]:
+    """The rows of each noise model, the paper's first."""
+    models = sorted({row.noise_model for row in summary}, key=lambda model: (model != "step", model))
+    return {model: [row for row in summary if row.noise_model == model] for model in models}
+
+
+def _by_task(summary: Sequence[SummaryRow]) -> list[list[SummaryRow]]:
+    """The rows of each task and noise model, task by task."""
+    envs = dict.fromkeys(row.env for row in summary)
+    of_env = ([row for row in summary if row.env == env] for env in envs)
+    return [rows for each in of_env for rows in _by_model(each).values()]
+
+
+def _findings(asked: Sequence[SummaryRow], run: Mapping[str, Any]) -> list[str]:
+    """Whether the run is finished, and what was found, in Markdown."""
+    found = [block for rows in _by_task(asked) for block in report.findings(rows)]
+    return [*report.what_is_left(run), *found, *report.what_differences_are(asked)]
+
+
+def _tables(summary: Sequence[SummaryRow]) -> list[str]:
+    """A table per task and noise model, in Markdown."""
+    return [block for rows in _by_task(summary) for block in report.tables_markdown(rows)]
+
+
 def _groups(summary: Sequence[SummaryRow]) -> list[Group]:
     """The charts of the rows that were asked for."""
-    models = sorted({row.noise_model for row in summary}, key=lambda model: (model != "step", model))
     found: list[Group] = []
-    for model in models:
-        rows = [row for row in summary if row.noise_model == model]
+    models = _by_model(summary)
+    for model, rows in models.items():
         level, envs = headline_level(rows), list(dict.fromkeys(row.env for row in rows))
         shown = {env: [row for row in rows if (row.env, row.noise_level) == (env, level)] for env in envs}
         of_env = {env: [row for row in rows if row.env == env] for env in envs}
         where, kind = condition_label(model, level), noise_label(model)
-        mark = f"{model}-" if model != models[0] else ""
+        mark = f"{model}-" if model != next(iter(models)) else ""
         bars = [
             (f"{mark}bars-{env}-{m.key}", charts.comparison(shown[env], m))
             for env in envs
@@ -146,7 +171,7 @@ def _groups(summary: Sequence[SummaryRow]) -> list[Group]:
                 )
             )
         both = [(f"{mark}pareto-{env}", charts.pareto(of_env[env])) for env in envs]
-        note = "Up and to the right is better. A line goes from the lowest noise level of an agent to its highest."
+        note = "Up and to the right is better. Over all levels: from the lowest noise level of an agent to its highest."
         found.append(Group(f"Safety against reach: {kind}", note, both))
     return found
 
@@ -158,8 +183,9 @@ def _trainings(
     bases = dict.fromkeys(split_row(row.agent)[0] for row in summary)
     found = []
     for env, checkpoints in run.get("agents", {}).items():
+        seen = set()  # rows of one training, such as those that act in different ways, have one chart
         for base in bases:
-            curves, seen = {}, set()
+            curves = {}
             for key, path in checkpoints.items():
                 row, _, seed = key.rpartition("-seed")
                 record = folder / Path(path).with_suffix(".json")
@@ -198,6 +224,19 @@ def _selection(tasks: Sequence[Mapping[str, Any]]) -> str:
     return f"{'; '.join(words)}.{lost}" if tasks else ""
 
 
+def _imports(run: Mapping[str, Any]) -> list[str]:
+    """The ``--import`` options of the command of a run: without them nobody knows its names."""
+    try:
+        words = shlex.split(run.get("command", ""))
+    except ValueError:
+        return []
+    option, found = "", []
+    for word in words:
+        option = word if word.startswith("-") else option
+        found += [word] * (option.partition("=")[0] == "--import")
+    return found
+
+
 def _repeat(run: Mapping[str, Any]) -> str:
     """Markdown: the command, the versions."""
     if "command" not in run:
@@ -222,17 +261,30 @@ def _pictures(out: Path) -> list[dict[str, str]]:
 
 def _html(markdown: str) -> str:
     """Markdown as HTML; HTML inside of it is text. Wide tables scroll by themselves."""
-    parser = MarkdownIt("commonmark", {"html": False}).enable("table")
-    html = parser.render(markdown)
-    wrapped = html.replace(
+    html = MarkdownIt("commonmark", {"html": False}).enable("table").render(markdown)
+    html = re.sub(r"<th(?!ead)", '<th scope="col"', html)
+    html = _grouped(html).replace("</table>", "</table></div>")
+    return html.replace(
         "<table>", '<div class="scroll" tabindex="0" role="region" aria-label="Table"><table>'
     )
-    wrapped = (
-        wrapped.replace("</table>", "</table></div>")
-        .replace("<th", '<th scope="col"')
-        .replace('<th scope="col"ead', "<thead")
-    )
-    return wrapped
+
+
+def _grouped(html: str) -> str:
+    """Tables whose rows begin a group where their second cell, the noise level, is another than in the row above."""
+    above = ""
+
+    def row(match: re.Match[str]) -> str:
+        nonlocal above
+        begins, above = match[2] != above, match[2]
+        mark = ' class="begins"' * begins
+        return f"<tr{mark}>{match[1]}{match[2]}"
+
+    return re.sub(r"<tr>(\n<td>.*</td>\n<td[^>]*>)(.*)", row, html)
+
+
+def _tied(text: str) -> str:
+    """``text`` with numbers and their per cent sign on one line."""
+    return text.replace(" %", "\N{NO-BREAK SPACE}%")
 
 
 def _packed(content: bytes) -> str:
@@ -256,8 +308,3 @@ def _template() -> Any:
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     return environment.from_string(_asset("report.html.j2"))
-
-
-def _command_path(folder: Path) -> str:
-    """A folder as a command line takes it."""
-    return folder.as_posix() if not folder.is_absolute() else folder.name

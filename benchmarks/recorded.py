@@ -10,6 +10,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -23,6 +24,7 @@ from benchmarks.trajectories import Trajectory, trace, trace_among
 from rise_agents import AGENTS, agent_class, checkpoint, pretrained
 from rise_agents.agent import acting_settings, nearest
 from rise_agents.rollout import side_by_side
+from rise_envs.task import env_class
 
 Row = dict[str, Any]  # a row of episodes.parquet
 _SHIPPED = " of rise_agents.pretrained, SHA-256 "  # between name and digest, as run.json names such weights
@@ -83,6 +85,7 @@ class Run:
             ValueError: what it takes is not there any more, or is another one now.
         """
         env, name, seed = row["env"], row["agent"], row["train_seed"]
+        require_registered(env)
         level = row["noise_level"]
         if is_reference(name):
             return make_policy(env, name, None, None, level)
@@ -189,6 +192,16 @@ def differences(trajectory: Trajectory, row: Row, rounded: bool = False, toleran
         if not math.isclose(value, row[name], rel_tol=0.0, abs_tol=tolerance):
             found.append(f"{name} {value}, stored {row[name]}")
     return found
+
+
+def require_registered(env: str) -> None:
+    """Raise ``ValueError`` if no such environment is registered here."""
+    try:
+        env_class(env)
+    except gym.error.Error:
+        raise ValueError(
+            f"no environment {env!r} is registered: --import the module that registers it"
+        ) from None
 
 
 def describe(row: Row) -> str:

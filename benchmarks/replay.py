@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import numpy as np
 from rich import box
 from rich.console import Console
@@ -20,9 +19,8 @@ from rich.table import Table
 from benchmarks.labels import TRUE, agent_label, condition_label, env_label, name_rows, split_row
 from benchmarks.recorded import Row, Run, open_run
 from benchmarks.report import read_run
-from benchmarks.trajectories import Trajectory, repeating
+from benchmarks.trajectories import Trajectory, repeating, step_seconds
 from rise_agents.cli import Parser, command
-from rise_envs.task import task_of
 
 _SUFFIXES = (".mp4", ".png")
 _LISTED = 20
@@ -108,7 +106,7 @@ def listed(run: Run, unsafe: bool = False, limit: int = _LISTED, **values: Any) 
 
 def told(row: Row, trajectory: Trajectory, rounded: bool) -> str:
     """What happened in an episode, and how it compares with what is stored, as a small text table."""
-    dt, closest = task_of(row["env"]).dt, trajectory.closest
+    dt, closest = step_seconds(row["env"]), trajectory.closest
     outcomes = trajectory.outcomes
     collision = np.flatnonzero(trajectory.cost)
     facts = {
@@ -148,7 +146,7 @@ def draw(row: Row, trajectory: Trajectory, files: Sequence[Path]) -> None:
             videos.write_strip(file, clip)
         else:
             frames = videos.captioned(clip, title, f"scenario {row['scenario']} · ")
-            videos.write_film(file, frames, 1 / task_of(row["env"]).dt)
+            videos.write_film(file, frames, 1 / step_seconds(row["env"]))
 
 
 def _result(row: Row) -> str:
@@ -183,7 +181,7 @@ def _the_row(run: Run, arguments: Any) -> Row:
     return run.find(**key, scenario=arguments.scenario)
 
 
-@command("benchmarks.replay", bad_input=(gymnasium.error.Error,))  # an environment that is not there
+@command("benchmarks.replay")
 def main(argv: Sequence[str] | None = None) -> int:
     """Replay or list; returns the exit code: 0 done, 1 a file cannot be written, 2 bad arguments or input, 130."""
     arguments = parser().parse_args(argv)
@@ -192,6 +190,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise ValueError(f"--out {str(file)!r} must end in {' or '.join(_SUFFIXES)}")
     if arguments.limit < 1:
         raise ValueError(f"--limit must be at least 1, got {arguments.limit}")
+    if arguments.unsafe and not arguments.list:
+        raise ValueError("--unsafe chooses among the episodes of a --list")
     run = open_run(arguments.run)
     name_rows(read_run(arguments.run).get("labels", {}))
     if arguments.list:

@@ -157,14 +157,21 @@ def training_markdown(run: Mapping[str, Any]) -> str:
 
 def claims(summary: Sequence[SummaryRow]) -> list[str]:
     """What was found, in words: paragraphs and lists of Markdown, last what the numbers in them mean."""
-    blocks = []
-    for env in dict.fromkeys(row.env for row in summary):
-        blocks += _findings(_rows_of(summary, env))
-    if any(row.against for row in summary):
-        seeds = several_seeds(summary)
-        drawn = "training seeds and scenarios" if seeds else "scenarios"
-        blocks.append(_DIFFERENCES.format(drawn) + _SURE * seeds)
-    return blocks
+    return [*findings(summary), *what_differences_are(summary)]
+
+
+def findings(summary: Sequence[SummaryRow]) -> list[str]:
+    """:func:`claims` without what the numbers mean."""
+    envs = dict.fromkeys(row.env for row in summary)
+    return [block for env in envs for block in _findings(_rows_of(summary, env))]
+
+
+def what_differences_are(summary: Sequence[SummaryRow]) -> list[str]:
+    """A paragraph on the differences in :func:`findings`; none where nobody is compared."""
+    if not any(row.against for row in summary):
+        return []
+    seeds = several_seeds(summary)
+    return [_DIFFERENCES.format("training seeds and scenarios" if seeds else "scenarios") + _SURE * seeds]
 
 
 def _condition(row: SummaryRow) -> tuple[str, float]:

@@ -15,7 +15,7 @@ from rise_agents import archive
 from rise_agents.agent import initial_state
 from rise_agents.rollout import policy_keys, rollout
 from rise_envs.noise_wrappers import ObservationNoise
-from rise_envs.task import metadata_of
+from rise_envs.task import describes_task, metadata_of, task_of
 
 Array = NDArray[np.float64]
 Act = Callable[[Any], NDArray]  # from an observation to an action; called once a step, in order
@@ -129,6 +129,13 @@ def draws(env_id: str) -> bool:
     return "rgb_array" in metadata_of(env_id)["render_modes"]
 
 
+def step_seconds(env_id: str) -> float:
+    """How long a step is; of an environment that describes no task: one of its pictures."""
+    if describes_task(env_id):
+        return task_of(env_id).dt
+    return 1.0 / metadata_of(env_id).get("render_fps", 10)
+
+
 def _parts(observation: Any) -> tuple[NDArray, NDArray, NDArray]:
     """State, goal and reading; of an environment that does not tell them apart all is state."""
     if isinstance(observation, Mapping):
@@ -158,7 +165,7 @@ class _Log:
             "goal": goal,
             "true": true,
             "reading": reading,
-            "clearance": info["clearance"],
+            "clearance": info.get("clearance", np.nan) if action is None else info["clearance"],
         }
         if action is not None:
             seen |= {"action": action, "reward": reward, "cost": info["cost"]}

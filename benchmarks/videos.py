@@ -15,10 +15,9 @@ from PIL import Image, ImageDraw, ImageFont
 
 from benchmarks.labels import env_label
 from benchmarks.policies import make_policy
-from benchmarks.trajectories import Act, Trajectory, acting, play
+from benchmarks.trajectories import Act, Trajectory, acting, play, step_seconds
 from rise_agents.agent import Progress
 from rise_agents.files import replace_file, replacing
-from rise_envs.task import describes_task, env_class, task_of
 
 Frame = NDArray[np.uint8]
 FRAMES_PER_SECOND = 10
@@ -47,9 +46,7 @@ def film(act: Act, env_id: str, seed: int, noise_model: str, noise_level: float)
     """
     frames: list[Frame] = []
     episode = play(act, env_id, seed, noise_model, noise_level, watch=lambda env: frames.append(_frame(env)))
-    metadata = env_class(env_id).metadata
-    dt = task_of(env_id).dt if describes_task(env_id) else 1.0 / metadata.get("render_fps", 10)
-    times = [i * dt for i in range(len(frames))]
+    times = [i * step_seconds(env_id) for i in range(len(frames))]
     return Clip(frames, times, outcome(episode), episode.closest, episode.outcomes["min_clearance"])
 
 

@@ -20,7 +20,7 @@ from gymnasium import spaces
 
 from benchmarks.configs import SHIPPED, read
 from benchmarks.pages import markdown_table
-from rise_agents import AGENTS, agent_class
+from rise_agents import AGENTS, agent_class, pretrained
 from rise_agents.agent import acting_settings
 from rise_agents.experts import EXPERTS, expert_names
 from rise_agents.filters import FILTERS
@@ -254,12 +254,17 @@ def agent(name: str) -> str:
     facts = [
         ("class", link(AGENTS[name])),
         ("learns from", kind.learns_from),
-        ("acts, when judged, with", judged),
+        ("acts, in the benchmark, with", judged),
     ]
     if acting := acting_settings(kind):
-        facts.append(("settings of a trained one", ", ".join(f"`{each}`" for each in sorted(acting))))
+        facts.append(("can be set after training", ", ".join(f"`{each}`" for each in sorted(acting))))
     facts += [(f"defaults in {env_id}", pairs(given)) for env_id, given in kind.PRESETS.items()]
-    facts.append(("brief", pairs(kind.BRIEF)))
+    facts.append(("in preset `smoke`", pairs(kind.BRIEF) or "the same"))
+    facts += [
+        ("[trained](../../agents.md#trained-agents)", f'`load_agent("{name}", env="{env_id}")`')
+        for known, env_id in pretrained.available()
+        if known == name
+    ]
     found = read([SHIPPED]).variants
     if mine := [f"`{each}`" for each, variant in found.items() if variant.agent == name]:
         facts.append(("[variants](../../benchmark.md#variants)", ", ".join(mine)))

@@ -47,6 +47,7 @@ napoleon_use_ivar = True  # an attribute that a class docstring lists is not des
 
 html_theme = "furo"
 html_title = project
+html_static_path, html_css_files = [str(HERE / "site.css")], ["site.css"]
 html_copy_source = html_show_copyright = html_show_sphinx = False
 
 
@@ -171,7 +172,8 @@ def with_short_arrays(app: Sphinx, what: str, name: str, thing: Any, options: An
 def only_what_is_there(app: Sphinx, docname: str, source: list[str]) -> None:
     """Results are on the site once they are published."""
     if docname == "index" and not (HERE / "results" / "README.md").exists():
-        source[0] = source[0].replace("\nresults/README\n", "\n")
+        lines = source[0].splitlines(keepends=True)
+        source[0] = "".join(line for line in lines if "results/README" not in line)
 
 
 def setup(app: Sphinx) -> None:

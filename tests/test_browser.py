@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 
@@ -44,6 +45,11 @@ def run(tmp_path_factory) -> Path:
         job.run(job.output, silent, **job.arguments)
     names = [str(job.output.relative_to(out)) for job in traces]
     known = {"rows": ["expert-cbf", "random"], "trajectories": names, "command": "python -m benchmarks.run"}
+    for seed in range(5):  # made up: nobody is trained here
+        points = [{"share": share / 10, "loss": 1 / (1 + share + seed)} for share in range(11)]
+        (out / f"{seed}.json").write_text(json.dumps({"curve": points}))
+    known["agents"] = {VEHICLE: {f"random-seed{seed}": f"{seed}.rise" for seed in range(5)}}
+    known["training"] = {"random": {"updates": 1}}
     summary = report.publish(merge([job.output for job in evaluations], out / "episodes.parquet"), known, out)
     write_page(summary, known, out, out)
     return out
@@ -127,6 +133,80 @@ def test_an_episode_is_chosen_watched_and_compared(page, task):
     assert picture(page, 0) != picture(page, 1)
 
 
+def until(page, condition: str) -> None:
+    """Wait for it; not by ``wait_for_function``, which needs an eval that the page's policy forbids."""
+    for _ in range(300):
+        if page.evaluate(condition):
+            return
+        page.wait_for_timeout(100)
+    raise AssertionError(condition)
+
+
+def test_a_click_plays_the_episode_where_it_can_be_seen(browser, run):
+    context = browser.new_context(viewport={"width": 390, "height": 844})
+    page = context.new_page()
+    page.goto((run / "report.html").as_uri())
+    page.wait_for_selector("html[data-ready=yes]", timeout=120_000)
+    row = page.locator("#player [data-part=rows] tr").last
+    row.scroll_into_view_if_needed()
+    row.click()
+    until(page, "explorer.time > 0")
+    top, bottom = page.locator("#player [data-part=panels]").evaluate(
+        "box => [box.getBoundingClientRect().top, box.getBoundingClientRect().bottom]"
+    )
+    assert top >= page.locator("nav").bounding_box()["height"] - 1 and bottom <= 844
+    context.close()
+    still = browser.new_context(reduced_motion="reduce")
+    page = still.new_page()
+    page.goto((run / "report.html").as_uri())
+    page.wait_for_selector("html[data-ready=yes]", timeout=120_000)
+    page.locator("#player [data-part=rows] tr").last.click()
+    assert not page.evaluate("explorer.playing")
+    still.close()
+
+
+def test_the_list_is_sorted_by_whose_clearance_one_clicks(page):
+    choose(page, "agent", "1")
+    choose(page, "other", "0")
+    heads, least = page.locator("#player [data-part=head] button"), {}
+    for column in (1, 2):
+        heads.nth(column).click()
+        cells = page.locator(
+            f"#player [data-part=rows] tr td:nth-child({column + 1}) small"
+        ).all_inner_texts()
+        least[column] = [float(cell.replace("−", "-").removesuffix("\xa0m")) for cell in cells]
+        assert least[column] == sorted(least[column]) and len(least[column]) > 3
+        assert (
+            page.locator("#player th[aria-sort]").inner_text().split()[0] == ("Random", "Expert")[column - 1]
+        )
+    assert least[1] != least[2]
+    heads.nth(0).click()
+    numbers = page.locator("#player [data-part=rows] tr").evaluate_all(
+        "all => all.map(e => +e.dataset.scenario)"
+    )
+    assert numbers == sorted(numbers)
+
+
+@pytest.mark.parametrize("task", ["0", "1"])
+def test_no_place_of_the_robot_is_out_of_the_picture(page, task):
+    choose(page, "task", task)
+    choose(page, "agent", "1")
+    for row in page.locator("#player [data-part=rows] tr").all():
+        row.locator("button").press("Enter")
+        outside = page.evaluate(
+            """() => explorer.scenes.flatMap((scene) => {
+                const at = scene.task.dim === 3 ? (p) => new Camera(scene).at(p) : null;
+                const steps = [...Array(scene.episode.steps + 1).keys()];
+                const places = steps.map((t) => Array.from(scene.data.position(t)));
+                const { low, high } = scene.bounds, inside = (p) => p.every((v, i) => v >= low[i] && v <= high[i]);
+                const within = ([x, y]) => x > 0 && x < scene.width && y > 0 && y < scene.height;
+                const drawn = (p) => !at || within(at(p));
+                return places.filter((p) => !inside(p) || !drawn(p));
+            })"""
+        )
+        assert outside == []
+
+
 def test_the_keyboard_plays_steps_and_changes_the_scenario(page):
     page.locator("#player").focus()
     page.keyboard.press("ArrowRight")
@@ -140,11 +220,7 @@ def test_the_keyboard_plays_steps_and_changes_the_scenario(page):
     page.keyboard.press("ArrowDown")
     assert shown(page)[0] == 0 and shown(page)[1] != scenario
     page.keyboard.press(" ")
-    for _ in range(300):  # not wait_for_function, which needs an eval that the page's policy forbids
-        if shown(page)[0] > 0:
-            break
-        page.wait_for_timeout(100)
-    assert shown(page)[0] > 0
+    until(page, "explorer.time > 0")
     page.keyboard.press(" ")
     assert not page.evaluate("explorer.playing")
 
@@ -198,6 +274,35 @@ def test_collisions_can_be_picked_out(page):
 def test_charts_are_drawn(page):
     assert page.locator(".chart .main-svg").count() >= 8
     assert page.locator(".chart .bars path").count() >= 8
+
+
+def test_the_list_follows_the_scenario_that_is_watched(page):
+    page.set_viewport_size({"width": 600, "height": 900})  # where the list is low
+    page.locator("#player").focus()
+    last = page.locator("#player [data-part=rows] tr").last
+    for _ in range(page.locator("#player [data-part=rows] tr").count()):
+        page.keyboard.press("ArrowDown")
+    box, around = last.bounding_box(), page.locator("#player .episodes").bounding_box()
+    assert box["y"] + box["height"] <= around["y"] + around["height"] + 2
+
+
+def test_no_words_of_a_chart_lie_on_each_other(browser, run):
+    for width in (390, 1280):
+        context = browser.new_context(viewport={"width": width, "height": 844})
+        page = context.new_page()
+        page.goto((run / "report.html").as_uri())
+        page.wait_for_selector("html[data-ready=yes]", timeout=120_000)
+        assert page.locator("#training .legend").count() == 1
+        overlapping = page.evaluate(
+            """() => [...document.querySelectorAll(".chart")].filter((chart) => {
+                const found = [".legend", ".xtitle"].map((each) => chart.querySelector(each)?.getBoundingClientRect());
+                if (found.some((box) => !box)) return false;
+                const [legend, title] = found;
+                return legend.top < title.bottom && title.top < legend.bottom;
+            }).map((chart) => chart.innerText.slice(0, 80))"""
+        )
+        assert overlapping == []
+        context.close()
 
 
 def test_a_phone_needs_no_scrolling_sideways(browser, run):

@@ -125,10 +125,10 @@ def test_the_numbers_are_those_of_the_table(page, tmp_path):
                 for key in ("safety", "reach")
             ]
             assert (name, f"{float(line['noise_level']):g}", *rates) in rows
-    assert (
-        "<strong>Ground vehicle.</strong> At noise level 1 (fresh noise at every step) RISE kept 85.9 %"
-        in page
+    found = (
+        "<strong>Ground vehicle.</strong> At noise level 1 (fresh noise at every step) RISE kept 85.9\xa0%"
     )
+    assert found in page  # a sign of per cent that begins a line says nothing
     assert "python -m benchmarks.run --agents rise pcbc" in page and "numpy 2.4" in page
 
 
@@ -137,7 +137,8 @@ def test_charts_have_the_numbers_of_the_table_and_are_such_that_plotly_takes_the
     ids = {attributes.get("id") for _, attributes in Tags(page).tags}
     assert set(drawn) <= ids
     for chart in drawn.values():
-        go.Figure(data=chart["data"], layout=chart["layout"])  # raises for what plotly does not know
+        for data in chart.get("choices", {"": chart.get("data")}).values():
+            go.Figure(data=data, layout=chart["layout"])  # raises for what plotly does not know
     (bars,) = drawn[f"bars-{VEHICLE}-safety"]["data"]
     assert bars["y"] == ["RISE", "PC-BC"] and bars["x"] == [85.9, 81.3]
     assert bars["error_x"]["array"] == pytest.approx([2, 2]) and bars["error_x"][
@@ -145,7 +146,50 @@ def test_charts_have_the_numbers_of_the_table_and_are_such_that_plotly_takes_the
     ] == pytest.approx([2, 2])
     line = drawn[f"lines-{VEHICLE}-safety"]["data"][1]
     assert (line["name"], line["x"], line["y"]) == ("PC-BC", [0, 1], [91.3, 81.3])
-    assert drawn[f"pareto-{VEHICLE}"]["data"][0]["y"] == [85.5, 85.5]
+    levels = drawn[f"pareto-{VEHICLE}"]["choices"]
+    assert list(levels) == ["noise level 1", "noise level 0", "all noise levels"]
+    *marks, best = levels["noise level 1"]
+    assert [(mark["name"], mark["x"], mark["y"]) for mark in marks] == [
+        ("RISE", [85.9], [85.5]),
+        ("PC-BC", [81.3], [71.2]),
+    ]
+    assert (best["x"], best["y"]) == ([85.9], [85.5])
+    assert levels["all noise levels"][0]["x"] == [97.9, 85.9]
+    assert list(drawn[f"pareto-{PANDA}"]["choices"]) == ["noise level 1"]
+
+
+def test_the_noise_of_the_paper_comes_first_in_words_charts_and_tables(tmp_path):
+    rows = [
+        row(agent=agent, model="episode", level=level) for agent in ("rise", "pcbc") for level in (1.0, 2.0)
+    ]
+    rows += [row(), row(agent="pcbc")]
+    text = write_page(rows, RUN, tmp_path, tmp_path).read_text()
+    findings, figures, tables = (
+        text.split(f'<section id="{name}">')[1] for name in ("findings", "figures", "tables")
+    )
+    for part in (findings, figures, tables):
+        assert part.index("fresh noise at every step") < part.index("one constant error per episode")
+    # A table for each, so no row has to say which it is of.
+    assert [cells[1] for cells in Tags(tables).rows] == [
+        "Noise level",
+        "1",
+        "1",
+        "Noise level",
+        "1",
+        "1",
+        "2",
+        "2",
+    ]
+    (begins,) = re.findall(
+        r'<tr class="begins">(.*?)</tr>', tables.partition("one constant error")[2], re.DOTALL
+    )
+    assert "RISE" in begins and ">2<" in begins
+
+
+def test_a_run_that_is_not_finished_says_so(tmp_path):
+    assert "Not finished" not in write_page(SUMMARY, RUN, tmp_path, tmp_path).read_text()
+    text = write_page(SUMMARY, RUN | {"unfinished": 3}, tmp_path, tmp_path).read_text()
+    assert text.index("3 pieces of work are left") < text.index("RISE kept")
 
 
 def test_the_page_loads_nothing(page):
@@ -253,6 +297,10 @@ def test_training_curves_come_from_beside_the_checkpoints(tmp_path):
     assert [name for name in drawn if name.startswith("training")] == [f"training-{VEHICLE}-rise"]
     assert drawn[f"training-{VEHICLE}-rise"]["choices"]["loss"][0]["y"] == [2.0, 1.0]
     assert "beta 0.1" in text
+    agents = run["agents"][VEHICLE] | {"rise-mean-seed0": "agents/rise-seed0.rise"}  # which no training made
+    both = [*SUMMARY, row(agent="rise-mean")]
+    text = write_page(both, run | {"agents": {VEHICLE: agents}}, tmp_path, tmp_path).read_text()
+    assert text.count('id="training-') == 1
     (tmp_path / "agents" / "rise-seed0.json").write_text("[]")
     with pytest.raises(ValueError, match=r"rise-seed0\.json is not the record of a training"):
         write_page(SUMMARY, run, tmp_path, tmp_path)
@@ -263,6 +311,31 @@ def test_without_trajectories_the_page_says_so(tmp_path):
         text = write_page(SUMMARY, RUN | {"trajectories": names}, tmp_path, tmp_path).read_text()
         assert "There are none to watch here" in text and "--no-videos" in text
         assert 'id="player"' not in text
+
+
+@pytest.mark.parametrize(
+    ("options", "imports"),
+    [
+        ("--import a.py 'my b.py' --agents rise --import=c.py", " --import a.py 'my b.py' --import=c.py"),
+        ("--agents rise", ""),
+        ("--agents 'an open quote", ""),
+    ],
+)
+def test_episodes_are_replayed_from_this_folder_with_the_modules_of_the_run(
+    traced, tmp_path, options, imports
+):
+    folder, names, _ = traced
+    run = {"command": f"python -m benchmarks.run {options}", "trajectories": names}
+    tags = Tags(write_page(SUMMARY, run, folder, tmp_path).read_text()).tags
+    assert [each["data-run"] for _, each in tags if "data-run" in each] == [f"{folder}{imports}"]
+
+
+def test_an_environment_of_one_s_own_must_be_imported(tmp_path):
+    facts = {"env": "Mine-v0", "row": "rise", "noise_model": "step", "noise_level": 1.0, "differing": []}
+    facts |= {"why": ["drawn"], "low": [-1.0] * 2, "high": [1.0] * 2}
+    trajectories.save(tmp_path / "a.rise", {0: episode(VEHICLE, 5, 0)}, facts)
+    with pytest.raises(ValueError, match="no environment 'Mine-v0' is registered: --import the module"):
+        write_page(SUMMARY, RUN | {"trajectories": ["a.rise"]}, tmp_path, tmp_path)
 
 
 def test_names_are_words_and_no_markup(tmp_path):

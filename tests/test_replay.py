@@ -7,6 +7,7 @@ import json
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
@@ -16,8 +17,8 @@ from PIL import Image
 from benchmarks import results
 from benchmarks.policies import Random
 from benchmarks.publish import publish
-from benchmarks.recorded import differences, open_run, recreated
-from benchmarks.replay import main
+from benchmarks.recorded import Run, differences, open_run, recreated
+from benchmarks.replay import main, parser, told
 from benchmarks.run import main as run_benchmark
 from benchmarks.trajectories import OUTCOMES, trace
 from benchmarks.videos import Clip, strip
@@ -168,6 +169,7 @@ def test_what_is_published_says_what_is_missing(vehicle, tmp_path, capsys):
         (["--agent", "rise", "--scenario", "0", "--noise-model", "drift"], "noise_model drift"),
         (["--env", "Nowhere-v0", "--agent", "rise", "--scenario", "0"], "no episode with env Nowhere-v0"),
         (["--agent", "rise", "--scenario", "0", "--out", "a.gif"], "must end in .mp4 or .png"),
+        (["--unsafe"], "--unsafe chooses among the episodes of a --list"),
         (["--list", "--limit", "0"], "--limit must be at least 1"),
         (["--lst"], "did you mean '--list'"),
     ],
@@ -193,6 +195,23 @@ def test_an_environment_that_draws_no_pictures_says_so():
     row = {"env": kinematic, "agent": "random", "scenario": 0, "env_seed": 2**31, "noise_model": "step"}
     with pytest.raises(ValueError, match="draws no pictures"):
         draw(row | {"noise_level": 0.0}, found, [])
+
+
+def test_an_environment_of_one_s_own_is_replayed_once_it_is_imported(own_names, tmp_path):
+    """One that describes no task, either."""
+    example = Path(__file__).parents[1] / "docs" / "examples" / "calm_pendulum.py"
+    row = {"env": "CalmPendulum-v0", "agent": "random", "train_seed": 0, "noise_model": "step"}
+    row |= {"noise_level": 0.0, "scenario": 0, "env_seed": 2**31, "safe": True, "arrived": False}
+    run = Run(tmp_path, {}, None, 1, ("step",))
+    with pytest.raises(ValueError, match="no environment 'CalmPendulum-v0' is registered: --import"):
+        run.policy(row)
+    parser().parse_args([str(tmp_path), "--list", "--import", str(example)])
+    found = trace(run.policy(row), row["env"], row["env_seed"])
+    row |= found.outcomes
+    assert recreated(run.policy(row), row, 1).outcomes == found.outcomes
+    assert f"{len(found.action)} ({len(found.action) / 30:.2f} s)" in told(
+        row, found, False
+    )  # 30 pictures a second
 
 
 def test_weights_of_the_package_must_be_those_that_were_evaluated(vehicle, tmp_path, monkeypatch):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from benchmarks import trajectories
 from benchmarks.policies import Random, make_policy
 from benchmarks.trajectories import OUTCOMES, Trajectory, acting, play, repeating, trace, trace_among
+from rise_agents.plugins import import_modules
 from rise_agents.rollout import rollout
 from rise_agents.seeds import episode_seeds
 from rise_envs import panda_kinematics
@@ -46,6 +48,14 @@ def test_a_trace_is_what_a_plain_loop_sees(env_id):
     assert found.clearance[-1] == info["clearance"]
     assert not np.array_equal(found.true, found.reading)
     env.close()
+
+
+def test_an_environment_need_not_say_how_clear_its_start_is(own_names):
+    """As any Gymnasium environment, whose ``reset`` knows nothing of ours; the start counts to no step."""
+    import_modules([str(Path(__file__).parents[1] / "docs" / "examples" / "calm_pendulum.py")])
+    found = trace(Random("CalmPendulum-v0"), "CalmPendulum-v0", 3)
+    assert np.isnan(found.clearance[0]) and found.outcomes["min_clearance"] == found.clearance[1:].min()
+    assert found.clearance[found.closest] == found.outcomes["min_clearance"]
 
 
 def test_outcomes_are_those_that_the_roll_out_counts():

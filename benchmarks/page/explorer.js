@@ -3,7 +3,7 @@
 
 class Explorer {
   constructor(root, tasks, numbers) {
-    Object.assign(this, { root, tasks, numbers, time: 0, playing: false, speed: 1, cache: new Map() });
+    Object.assign(this, { root, tasks, numbers, time: 0, playing: false, speed: 1, by: 0, cache: new Map() });
     this.part = (name) => root.querySelector(`[data-part="${name}"]`);
     this.fill("task", tasks.map((task, n) => [n, task.label]));
     for (const name of ["task", "agent", "other", "level", "which"]) {
@@ -52,19 +52,38 @@ class Explorer {
     return this.task.episodes.find(fits);
   }
 
-  // The rows of the list, the least clearance of the first agent first.
+  // The rows of the list: by the least clearance of one of the agents (0, 1), or by their numbers (-1).
   list() {
     const { task } = this, agent = Number(this.part("agent").value), other = Number(this.part("other").value);
+    const agents = [agent, other].filter((each) => each >= 0);
+    this.by = Math.min(this.by, agents.length - 1);
+    const least = (number) => this.episode(agents[this.by], number)?.least ?? Infinity;
     const which = this.part("which").value;
     const wanted = ({ episode, why }) => episode && (which === "all" || why === which || (which === "unsafe" && episode.cost > 0));
     this.rows = Object.entries(task.scenarios)
       .map(([number, { why }]) => ({ scenario: Number(number), why, episode: this.episode(agent, Number(number)) }))
       .filter(wanted)
-      .sort((a, b) => a.episode.least - b.episode.least);
-    const names = [task.agents[agent], other < 0 ? null : task.agents[other]].filter(Boolean);
-    this.part("head").replaceChildren(cell("th", "Scenario"), ...names.map((each) => cell("th", each.label)));
+      .sort((a, b) => (this.by < 0 ? a.scenario - b.scenario : least(a.scenario) - least(b.scenario)));
+    const names = ["Scenario", ...agents.map((each) => task.agents[each].label)];
+    this.part("head").replaceChildren(...names.map((name, n) => this.heading(name, n - 1)));
     this.part("rows").replaceChildren(...this.rows.map((row) => this.row(row, other)));
     this.part("none").textContent = this.rows.length ? "" : "No such episode is among those that are shown.";
+  }
+
+  heading(name, by) {
+    const made = cell("th", ""), button = document.createElement("button");
+    button.type = "button";
+    button.textContent = name;
+    button.title = by < 0 ? "By number" : "The least clearance first";
+    if (this.by === by) made.setAttribute("aria-sort", "ascending");
+    made.append(button);
+    button.addEventListener("click", () => {
+      this.by = by;
+      this.list();
+      this.mark();
+      this.part("head").children[by + 1].firstChild.focus();
+    });
+    return made;
   }
 
   row({ scenario, why, episode }, other) {
@@ -77,7 +96,11 @@ class Explorer {
     line.append(first, result(episode));
     if (other >= 0) line.append(result(this.episode(other, scenario)));
     line.dataset.scenario = scenario;
-    line.addEventListener("click", () => this.watch(scenario));
+    line.addEventListener("click", () => {
+      this.watch(scenario);
+      this.part("panels").scrollIntoView({ block: "nearest" });
+      if (!this.playing && !matchMedia("(prefers-reduced-motion: reduce)").matches) this.toggle();
+    });
     return line;
   }
 
@@ -88,12 +111,7 @@ class Explorer {
 
   watch(scenario) {
     this.scenario = scenario;
-    for (const line of this.part("rows").children) {
-      const current = Number(line.dataset.scenario) === scenario;
-      line.classList.toggle("current", current);
-      if (current) line.setAttribute("aria-current", "true");
-      else line.removeAttribute("aria-current");
-    }
+    this.mark();
     const agents = [this.part("agent").value, this.part("other").value].map(Number);
     const shown = agents.map((agent) => this.episode(agent, scenario)).filter(Boolean);
     this.panels(shown);
@@ -102,14 +120,40 @@ class Explorer {
     this.seek(0);
   }
 
-  panels(episodes) {
-    const { task } = this, box = this.part("panels");
-    const reach = Math.max(...task.high.map(Math.abs), ...task.low.map(Math.abs));
-    let extent = 2 * (reach + 0.5);
-    for (const episode of episodes) {
-      const data = this.decode(episode);
-      for (let t = 0; t <= episode.steps; t++) extent = Math.max(extent, 2 * (Math.max(...data.position(t).map(Math.abs)) + 1));
+  // Shows which row of the list is watched, and brings it into the list's view.
+  mark() {
+    const list = this.part("rows").closest(".episodes");
+    for (const line of this.part("rows").children) {
+      const current = Number(line.dataset.scenario) === this.scenario;
+      line.classList.toggle("current", current);
+      if (current) line.setAttribute("aria-current", "true");
+      else line.removeAttribute("aria-current");
+      if (!current) continue;
+      const view = list.getBoundingClientRect(), box = line.getBoundingClientRect();
+      const above = view.top + this.part("head").offsetHeight - box.top, below = box.bottom - view.bottom;
+      list.scrollTop += above > 0 ? -above : Math.max(below, 0);
     }
+  }
+
+  // The least box around the task's own and all places of the robot in these episodes: nothing leaves the picture.
+  bounds(episodes) {
+    const low = this.task.low.slice(), high = this.task.high.slice();
+    for (const episode of episodes) {
+      const data = this.decode(episode), first = data.body ? Array.from(data.body(0)) : [];
+      const places = Array.from({ length: episode.steps + 1 }, (_, t) => Array.from(data.position(t))).flat();
+      for (const list of [first, places]) {
+        list.forEach((value, i) => {
+          const axis = i % this.task.dim;
+          low[axis] = Math.min(low[axis], value);
+          high[axis] = Math.max(high[axis], value);
+        });
+      }
+    }
+    return { low, high };
+  }
+
+  panels(episodes) {
+    const { task } = this, box = this.part("panels"), bounds = this.bounds(episodes);
     box.replaceChildren();
     this.scenes = episodes.map((episode) => {
       const agent = task.agents[episode.agent], figure = document.createElement("figure");
@@ -123,16 +167,17 @@ class Explorer {
       canvas.setAttribute("role", "img");
       figure.append(caption, canvas);
       box.append(figure);
-      return new Scene(canvas, task, agent.colour).show(episode, this.decode(episode), extent);
+      return new Scene(canvas, task, agent.colour).show(episode, this.decode(episode), bounds);
     });
     for (const scene of this.scenes) {
       scene.turned = (angle) => this.scenes.forEach((each) => { each.angle = angle; each.draw(each.time); });
       if (this.angle && task.dim === 3) scene.angle = this.angle;
     }
     box.classList.toggle("two", episodes.length > 1);
+    box.classList.toggle("space", task.dim === 3);
     const agent = task.agents[episodes[0].agent], level = this.part("level").value;
-    this.part("command").textContent = `python -m benchmarks.replay ${this.root.dataset.run} --env ${task.env} ` +
-      `--agent ${agent.row} --noise-level ${level} --scenario ${this.scenario} --out clip.mp4 frames.png`;
+    this.part("command").replaceChildren(...unbroken(`python -m benchmarks.replay ${this.root.dataset.run} --env ${task.env} ` +
+      `--agent ${agent.row} --noise-level ${level} --scenario ${this.scenario} --out clip.mp4 frames.png`));
   }
 
   seek(time) {
@@ -198,6 +243,15 @@ function cell(tag, words) {
   return made;
 }
 
+// A command that breaks between its words alone: browsers break lines after the dashes of an option, too.
+function unbroken(command) {
+  return command.trim().split(" ").flatMap((word) => {
+    const made = document.createElement("span");
+    made.textContent = word;
+    return [made, " "];
+  });
+}
+
 function mark(why) {
   const made = document.createElement("small");
   made.textContent = why;
@@ -219,7 +273,7 @@ function result(episode) {
 // Of small numbers more digits: a touch must not read as "−0.00".
 function metres(value) {
   const size = Math.abs(value), digits = size < 0.001 ? 4 : size < 0.1 ? 3 : 2;
-  return `${value < 0 ? "−" : ""}${size.toFixed(digits)} m`;
+  return `${value < 0 ? "−" : ""}${size.toFixed(digits)}\u00a0m`;
 }
 const words = { bad: "✕ collision", good: "✓ reached", fair: "– not reached" };
 const kind = (episode) => (episode.cost > 0 ? "bad" : episode.arrived ? "good" : "fair");

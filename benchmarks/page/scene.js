@@ -10,8 +10,8 @@ class Scene {
     if (task.dim === 3) this.orbit();
   }
 
-  show(episode, data, extent) {
-    Object.assign(this, { episode, data, extent });
+  show(episode, data, bounds) {
+    Object.assign(this, { episode, data, bounds });
     this.canvas.setAttribute("aria-label", `${this.task.label}, scenario ${episode.scenario}`);
     return this;
   }
@@ -81,9 +81,10 @@ class Scene {
 // --- the plane ----------------------------------------------------------------------------------------------------
 
 function drawPlane(scene, moment) {
-  const { context: c, task, width, extent } = scene;
-  const half = extent / 2, scale = width / extent;
-  const at = ([x, y]) => [(x + half) * scale, (half - y) * scale];
+  const { context: c, task, width, bounds } = scene;
+  const centre = bounds.low.map((value, i) => (value + bounds.high[i]) / 2);
+  const half = 0.52 * Math.max(...minus(bounds.high, bounds.low)) + task.robotRadius, scale = width / (2 * half);
+  const at = ([x, y]) => [(x - centre[0] + half) * scale, (half - y + centre[1]) * scale];
   c.fillStyle = colour("outside");
   c.fillRect(0, 0, width, width);
   const [left, top] = at([task.low[0], task.high[1]]), [right, bottom] = at([task.high[0], task.low[1]]);
@@ -151,14 +152,14 @@ function drawPath(c, scene, moment, at) {
 
 class Camera {
   constructor(scene) {
-    const { low, high } = scene.bounds();
+    const { low, high } = scene.bounds;
     const centre = low.map((value, i) => (value + high[i]) / 2), { turn, rise } = scene.angle;
     const size = Math.hypot(...low.map((value, i) => high[i] - value));
     centre[2] -= 0.06 * size; // the table in front needs room
     const back = [Math.cos(turn) * Math.cos(rise), Math.sin(turn) * Math.cos(rise), Math.sin(rise)];
     const right = [-Math.sin(turn), Math.cos(turn), 0], up = cross3(back, right);
     Object.assign(this, { eye: plus(centre, back, 1.4 * size), right, up, back, scene, low, high });
-    this.focal = 1.22 * Math.min(scene.width, scene.height / 0.8);
+    this.focal = 1.5 * Math.min(scene.width, scene.height / 0.8);
   }
 
   depth(p) { return -dot(minus(p, this.eye), this.back); }
@@ -171,15 +172,6 @@ class Camera {
 
   size(length, p) { return (length * this.focal) / Math.max(this.depth(p), 0.05); }
 }
-
-Scene.prototype.bounds = function () {
-  const low = this.task.low.slice(), high = this.task.high.slice(), body = this.data.body && this.data.body(0);
-  for (let i = 0; body && i < body.length; i++) {
-    low[i % 3] = Math.min(low[i % 3], body[i]);
-    high[i % 3] = Math.max(high[i % 3], body[i]);
-  }
-  return { low, high };
-};
 
 function drawSpace(scene, moment) {
   const { context: c, task, width, height } = scene, eye = new Camera(scene);

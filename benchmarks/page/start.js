@@ -6,6 +6,7 @@
     return;
   }
   root.classList.add("live");
+  for (const code of document.querySelectorAll(".repeat pre code")) code.replaceChildren(...unbroken(code.textContent));
   const page = JSON.parse(await text("data"));
   if (page.tasks.length) {
     window.explorer = new Explorer(document.getElementById("player"), page.tasks, await unpacked("numbers"));
