@@ -41,7 +41,7 @@ _MARKERS = "osD^vPX*<>"
 INK, FAINT, GRID = "#222222", "#6A6A6A", "#E6E6E6"
 _WIDTH = 10.0  # inches
 _LEGEND_LETTERS = 90  # that fit into its width
-_NOTE_LETTERS, _NOTE_HEIGHT = 117, 0.2  # that fit beside each other; inches from line to line
+_NOTE_LETTERS, _NOTE_HEIGHT = 130, 0.2  # that fit beside each other; inches from line to line
 
 Rate = tuple[float, float, float]  # rate, lower end, upper end
 
