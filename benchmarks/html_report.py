@@ -23,7 +23,15 @@ from markdown_it import MarkdownIt
 
 from benchmarks import charts, explorer, plots, report
 from benchmarks.charts import Chart
-from benchmarks.labels import agent_label, condition_label, env_label, noise_label, sample, split_row
+from benchmarks.labels import (
+    agent_label,
+    condition_label,
+    env_label,
+    model_order,
+    noise_label,
+    sample,
+    split_row,
+)
 from benchmarks.plots import METRICS
 from benchmarks.results import atomic_write_text
 from benchmarks.sections import sections
@@ -120,7 +128,7 @@ def write_page(summary: Sequence[SummaryRow], run: Mapping[str, Any], folder: Pa
 
 def _by_model(summary: Sequence[SummaryRow]) -> dict[str, list[SummaryRow]]:
     """The rows of each noise model, the paper's first."""
-    models = sorted({row.noise_model for row in summary}, key=lambda model: (model != "step", model))
+    models = sorted({row.noise_model for row in summary}, key=model_order)
     return {model: [row for row in summary if row.noise_model == model] for model in models}
 
 

@@ -77,6 +77,11 @@ def env_label(env: str) -> str:
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", " ", match[1]).capitalize()
 
 
+def model_order(model: str) -> tuple[bool, str]:
+    """By what noise models are sorted: the paper's first, then by name."""
+    return model != "step", model
+
+
 def noise_label(model: str) -> str:
     """A noise model (``rise_envs.noise``) in a few words: ``delay:2@position`` is "delayed readings (2), …"."""
     return " + ".join(

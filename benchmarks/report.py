@@ -22,6 +22,7 @@ from benchmarks.labels import (
     count,
     env_label,
     interval,
+    model_order,
     name_rows,
     noise_label,
     p_value,
@@ -185,7 +186,9 @@ def _rows_of(summary: Sequence[SummaryRow], env: str) -> list[SummaryRow]:
         raise ValueError(
             f"no results of {env}; there are some of {', '.join(sorted({r.env for r in summary}))}"
         )
-    return sorted(rows, key=_condition)  # stable: agents keep their order
+    return sorted(
+        rows, key=lambda row: (model_order(row.noise_model), row.noise_level)
+    )  # agents keep their order
 
 
 def _title(rows: Sequence[SummaryRow]) -> str:
@@ -325,7 +328,7 @@ def publish(rows: pa.Table, run: Mapping[str, Any], out: Path) -> list[SummaryRo
 def _draw(summary: Sequence[SummaryRow], out: Path) -> dict[str, str]:
     """The figures of the rows that were asked for; path → caption."""
     figures: dict[str, str] = {}
-    models = sorted({row.noise_model for row in summary}, key=lambda model: (model != "step", model))
+    models = sorted({row.noise_model for row in summary}, key=model_order)
     for model in models:
         level = headline_level([row for row in summary if row.noise_model == model])
         drawn = (plots.comparison(summary, level, model), plots.noise_curve(summary, model))

@@ -150,7 +150,7 @@ def test_an_interval_that_ends_at_0_holds_it():
         assert page.count("no difference that these episodes can show") == 2
 
 
-def test_each_noise_model_speaks_at_its_own_headline_level():
+def test_each_noise_model_speaks_at_its_own_headline_level_the_paper_s_first():
     summary = [
         *(
             row(),
@@ -162,7 +162,7 @@ def test_each_noise_model_speaks_at_its_own_headline_level():
     ]
     page = report.summary_markdown(summary, RUN)
     findings = re.findall(r"At noise level (\S+) \((.*?)\) RISE.*\n\n- RISE kept (\S+) points", page)
-    assert findings == [("0.5", "a drifting error", "2.0"), ("1", "fresh noise at every step", "9.9")]
+    assert findings == [("1", "fresh noise at every step", "9.9"), ("0.5", "a drifting error", "2.0")]
 
 
 def test_page_names_the_intervals_in_its_brackets():
