@@ -309,7 +309,10 @@ function drawClearance(canvas, explorer) {
   c.fillText("clearance, m", width - PLOT.right, 0);
   c.textBaseline = "middle";
   c.textAlign = "center";
-  for (const value of ticks(0, length * task.dt)) c.fillText(`${value} s`, x(value / task.dt), height - PLOT.bottom + 12);
+  for (const value of ticks(0, length * task.dt)) {
+    const words = `${value} s`, inside = width - c.measureText(words).width / 2;
+    c.fillText(words, Math.min(x(value / task.dt), inside), height - PLOT.bottom + 12);
+  }
   scenes.forEach((scene, n) => {
     c.strokeStyle = scene.robot;
     c.lineWidth = 2;
