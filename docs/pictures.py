@@ -1,7 +1,7 @@
 """The moving pictures of the pages of environments and agents.
 
-    python docs/pictures.py runs/quick                # of all environments, and of the agents of a finished run
-    python docs/pictures.py runs/quick --only rise    # of one of them
+    python docs/pictures.py                # of all environments, and of the agents that come with the package
+    python docs/pictures.py --only rise    # of one of them
 
 Each shows the first validation scenario that ends safely at its goal. They are committed: drawing takes minutes.
 """
@@ -19,7 +19,7 @@ from PIL import Image
 from benchmarks.policies import make_policy
 from benchmarks.trajectories import acting, play
 from benchmarks.videos import Clip, film
-from rise_agents import AGENTS
+from rise_agents import AGENTS, pretrained
 from rise_agents.experts import EXPERTS
 from rise_agents.seeds import episode_seeds
 from rise_envs import ENVS, STAND_INS
@@ -28,11 +28,6 @@ from rise_envs.task import env_class
 IMAGES = Path(__file__).resolve().parent / "images"
 WIDTH, COLOURS, FRAMES = 400, 192, 30  # px, of the palette, at most in a picture
 TRIED = 50  # scenarios
-
-
-def checkpoint(run: Path, env_id: str, agent: str) -> Path | None:
-    """The agent of training seed 0 in a run folder, if it has one."""
-    return next(iter(sorted((run / "agents" / env_id).glob(f"{agent}-seed0-*.rise"))), None)
 
 
 def success(env_id: str, row: str, trained: Path | None, level: float) -> Clip:
@@ -64,7 +59,7 @@ def write_gif(path: Path, clip: Clip) -> None:
     first.save(path, save_all=True, append_images=rest, duration=times, loop=0, optimize=True)
 
 
-def pictures(run: Path) -> Iterator[tuple[Path, str, str, Path | None, float]]:
+def pictures() -> Iterator[tuple[Path, str, str, Path | None, float]]:
     """Where to put each picture, and what it shows: environment, row, checkpoint, noise level."""
     for env_id in ENVS:
         if env_id in STAND_INS or "rgb_array" not in env_class(env_id).metadata["render_modes"]:
@@ -72,17 +67,17 @@ def pictures(run: Path) -> Iterator[tuple[Path, str, str, Path | None, float]]:
         if expert := next((name for env, name in EXPERTS if env == env_id), None):
             yield IMAGES / "envs" / f"{env_id}.gif", env_id, f"expert-{expert}", None, 1.0
         for agent in AGENTS:
-            if trained := checkpoint(run, env_id, agent):
+            if (agent, env_id) in pretrained.available():
+                trained = pretrained.find(agent, env_id)
                 yield IMAGES / "agents" / f"{agent}-{env_id}.gif", env_id, agent, trained, 1.0
 
 
 def main(arguments: list[str]) -> None:
     """Draw them."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("run", type=Path, help="folder of a finished run, for its agents")
     parser.add_argument("--only", help="part of the names of the files to make")
     chosen = parser.parse_args(arguments)
-    for path, env_id, row, trained, level in pictures(chosen.run):
+    for path, env_id, row, trained, level in pictures():
         if (chosen.only or "") in path.name:
             write_gif(path, success(env_id, row, trained, level))
             print(f"{path.relative_to(IMAGES.parent)}  {path.stat().st_size / 1000:.0f} kB")
