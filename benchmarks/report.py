@@ -234,9 +234,9 @@ def _claim(row: SummaryRow) -> str:
     # The columns hold what the row has more than the first agent; the sentence turns them round.
     safety = _difference(row.safety_diff, row.safety_diff_low, row.safety_diff_high, row.safety_diff_p)
     reach = _difference(row.reach_diff, row.reach_diff_low, row.reach_diff_high, row.reach_diff_p)
-    other = agent_label(row.agent)
+    other = f"{'than' if row.safety_diff else 'as'} {agent_label(row.agent)}"
     return (
-        f"{agent_label(row.against)} kept {safety[0]} episodes safe than {other} {safety[1]}, "
+        f"{agent_label(row.against)} kept {safety[0]} episodes safe {other} {safety[1]}, "
         f"and reached the goal without collision in {reach[0]} {reach[1]}."
     )
 
@@ -247,7 +247,7 @@ def _difference(
     """A difference, seen from the other side, in points; and its interval, with what that says."""
     if diff is None or low is None or high is None or p is None:
         raise ValueError("a row that is compared with another needs all numbers of the comparison")
-    amount = f"{points(abs(diff))} points {'fewer' if diff > 0 else 'more'}"
+    amount = f"{points(abs(diff))} points {'fewer' if diff > 0 else 'more'}" if diff else "as many"
     verdict = ", no difference that these episodes can show" if low <= 0 <= high else ""
     return amount, f"{points_interval(0 - high, 0 - low)}{verdict} ({p_value(p)})"
 
