@@ -90,7 +90,7 @@ def execute(plan: Plan, out: Path, how: How) -> Outcome:
     for folder in [out, *(path for path in out.rglob("*") if path.is_dir())]:
         sweep(folder)
     tidy(out)
-    name_rows({name: variant.label for name, variant in plan.variants.items() if variant.label})
+    name_rows(plan.labels())
     with Display() as display:
         evaluations = evaluation_jobs(plan, out)
         found = published.matches(how.source, plan, out, evaluations) if how.source else []

@@ -139,6 +139,10 @@ class Plan:
         only = self.variants[base].envs if base in self.variants else ()
         return not only or env in only
 
+    def labels(self) -> dict[str, str]:
+        """How variants are called, for :func:`benchmarks.labels.name_rows`."""
+        return {name: variant.label for name, variant in self.variants.items() if variant.label}
+
     def agent_of(self, row: str) -> str:
         """The agent that is trained for a row: a key of ``AGENTS``; empty for what is not trained."""
         base, _ = split_row(row)

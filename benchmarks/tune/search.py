@@ -139,7 +139,7 @@ def execute(search: Search, sets: Mapping[str, tuple[Path, str]], out: Path, how
     Raises:
         ValueError: recorded demonstrations do not suffice, or a file is not what it should be.
     """
-    name_rows({name: variant.label for name, variant in search.plan.variants.items() if variant.label})
+    name_rows(search.plan.labels())
     for folder in [out, *(path for path in out.rglob("*") if path.is_dir())]:
         sweep(folder)
     tidy(out)
