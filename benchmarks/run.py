@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from benchmarks import executor_options
+from benchmarks import job_options
 from benchmarks.labels import count
 from benchmarks.presets import PRESETS
 from benchmarks.protocol import Plan, make_plan, with_filters
@@ -126,27 +126,8 @@ def parser() -> Parser:
         dest="settings",
         help="settings of an agent or variant, as in rise.beta=0.1 or cppo@RISE-SafePanda-v0.total_steps=100000",
     )
-    p.add_argument(
-        "--workers",
-        type=int,
-        metavar="N",
-        help="jobs at once (default: one per core); results do not depend on it",
-    )
-    executor_options.add_options(p)
+    job_options.add_options(p)
     p.add_argument("--device", default="cpu", help="torch device that agents train on (default: cpu)")
-    p.add_argument(
-        "--checkpoint-every",
-        type=float,
-        default=15.0,
-        metavar="S",
-        help="seconds between two checkpoints of a training, from which it goes on if interrupted (default: 15)",
-    )
-    p.add_argument(
-        "--tensorboard",
-        type=Path,
-        metavar="DIR",
-        help="write the figures of every training there as event files, which TensorBoard draws",
-    )
     p.add_argument(
         "--hours",
         type=float,
@@ -183,17 +164,10 @@ def plan_of(arguments: argparse.Namespace) -> Plan:
     """The plan that the arguments ask for, every setting checked before any work starts."""
     from rise_envs import ENVS, STAND_INS
 
-    if arguments.workers is not None and arguments.workers < 1:
-        raise ValueError(f"--workers must be at least 1, got {arguments.workers}")
-    if not arguments.checkpoint_every >= 0:
-        raise ValueError(f"--checkpoint-every must not be negative, got {arguments.checkpoint_every}")
     if arguments.hours is not None and not 0 < arguments.hours < math.inf:
         raise ValueError(f"--hours must be a number above 0, got {arguments.hours:g}")
     if arguments.pretrained and (arguments.seeds or arguments.demos):
         raise ValueError("--pretrained trains nobody: leave out --seeds and --demos")
-    if arguments.tensorboard is not None:
-        prepare_events(arguments.tensorboard)
-    executor_options.check(arguments)
     reported = [env for env in ENVS if env not in STAND_INS]
     plan = make_plan(
         arguments.preset,
@@ -213,15 +187,8 @@ def plan_of(arguments: argparse.Namespace) -> Plan:
 
     check_settings(plan)
     _check_device(arguments.device)
+    job_options.check(arguments)
     return plan
-
-
-def prepare_events(folder: Path) -> None:
-    """Raise ``ValueError`` unless event files can be written to a folder."""
-    from rise_agents.figures import check_installed
-
-    check_installed()
-    prepare_folder(folder)
 
 
 def _source(folder: Path | None, out: Path) -> Published | None:
@@ -298,8 +265,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     out = arguments.out or Path("runs") / arguments.preset
     source = _source(arguments.published, out)
     prepare_folder(out)
-    folders = [folder for folder in (out, arguments.tensorboard) if folder is not None]
-    with executor_options.pool_of(arguments, folders) as pool, at_work():
+    with job_options.pool_of(arguments, out) as pool, at_work():
         from benchmarks.executors import never
         from benchmarks.pipeline import How, execute
         from rise_agents.files import sole_user

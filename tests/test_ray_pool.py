@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks import executor_options, ray_pool, shipping
+from benchmarks import job_options, ray_pool, shipping
 from benchmarks.executors import ATTEMPTS, run_jobs
 from benchmarks.jobs import Job
 from benchmarks.ray_pool import RayPool
@@ -367,7 +367,7 @@ def test_the_mailbox_keeps_the_latest_of_each():
 )
 def test_bad_options_get_one_line(command, options, reason, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(executor_options.importlib.util, "find_spec", lambda name: name)
+    monkeypatch.setattr(job_options.importlib.util, "find_spec", lambda name: name)
     assert command(options) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and reason in error
@@ -375,7 +375,7 @@ def test_bad_options_get_one_line(command, options, reason, capsys, tmp_path, mo
 
 
 def test_an_address_that_does_not_answer_is_named(capsys, tmp_path, monkeypatch):
-    monkeypatch.setattr(executor_options.importlib.util, "find_spec", lambda name: name)
+    monkeypatch.setattr(job_options.importlib.util, "find_spec", lambda name: name)
     with socket.socket() as closed:  # bound, but nobody listens
         closed.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{closed.getsockname()[1]}"
@@ -388,39 +388,41 @@ def test_where_a_cluster_is_looked_for(tmp_path, monkeypatch):
     """Where it answers; one that has ended leaves the file in which Ray would find it, and would wait for it."""
     monkeypatch.setenv("RAY_TMPDIR", str(tmp_path))
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
-    assert [executor_options._checked(given) for given in (None, "local")] == ["local", "local"]
+    assert [job_options._checked(given) for given in (None, "local")] == ["local", "local"]
     with socket.socket() as listening:
         listening.bind(("127.0.0.1", 0))
         listening.listen()
         address = f"127.0.0.1:{listening.getsockname()[1]}"
         (tmp_path / "ray").mkdir()
         (tmp_path / "ray" / "ray_current_cluster").write_text(address)
-        assert [executor_options._checked(given) for given in (None, "auto", address)] == [
+        assert [job_options._checked(given) for given in (None, "auto", address)] == [
             "auto",
             "auto",
             address,
         ]
         monkeypatch.setenv("RAY_ADDRESS", address)
-        assert executor_options._checked(None) == address
+        assert job_options._checked(None) == address
     with pytest.raises(ValueError, match=f"^RAY_ADDRESS {address}: no answer"):
-        executor_options._checked(None)
+        job_options._checked(None)
     monkeypatch.delenv("RAY_ADDRESS")
-    assert executor_options._checked(None) == "local"
+    assert job_options._checked(None) == "local"
     with pytest.raises(ValueError, match=r"^--ray-address auto: this machine is part of no Ray cluster$"):
-        executor_options._checked("auto")
+        job_options._checked("auto")
 
 
 def _arguments(**others):
-    return argparse.Namespace(**{"executor": "ray", "ray_address": None, "device": "cpu", **others})
+    parser = argparse.ArgumentParser()
+    job_options.add_options(parser)
+    return argparse.Namespace(**{**vars(parser.parse_args([])), "executor": "ray", "device": "cpu", **others})
 
 
 def test_without_ray_the_extra_is_named(monkeypatch):
-    monkeypatch.setattr(executor_options.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(job_options.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"pip install 'rise-suite\[ray\]'"):
-        executor_options.check(_arguments())
-    executor_options.check(_arguments(executor="local"))
+        job_options.check(_arguments())
+    job_options.check(_arguments(executor="local"))
 
 
 def test_a_device_is_refused():
     with pytest.raises(ValueError, match="--executor ray gives each job a CPU"):
-        executor_options.check(_arguments(device="cuda"))
+        job_options.check(_arguments(device="cuda"))

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from benchmarks import executor_options
-from benchmarks.run import parse_settings, prepare_events
+from benchmarks import job_options
+from benchmarks.run import parse_settings
 from rise_agents import AGENTS
 from rise_agents.cli import INTERRUPTED, Parser, at_work, command, prepare_folder
 
@@ -108,21 +108,7 @@ def parser() -> Parser:
         dest="settings",
         help="settings that are not searched but the same in all trials, for instance rise.average=4",
     )
-    p.add_argument("--workers", type=int, metavar="N", help="jobs at once (default: one per core)")
-    executor_options.add_options(p)
-    p.add_argument(
-        "--checkpoint-every",
-        type=float,
-        default=15.0,
-        metavar="S",
-        help="seconds between two checkpoints of a training, from which it goes on if interrupted (default: 15)",
-    )
-    p.add_argument(
-        "--tensorboard",
-        type=Path,
-        metavar="DIR",
-        help="write the figures of every training there as event files, which TensorBoard draws",
-    )
+    job_options.add_options(p)
     p.add_argument(
         "--write", type=Path, metavar="FILE", help="settings file that the chosen settings go into, too"
     )
@@ -148,10 +134,6 @@ def search_of(a: argparse.Namespace) -> Search:
     from rise_agents.agent import nearest
     from rise_envs import ENVS, STAND_INS
 
-    if a.workers is not None and a.workers < 1:
-        raise ValueError(f"--workers must be at least 1, got {a.workers}")
-    if not a.checkpoint_every >= 0:
-        raise ValueError(f"--checkpoint-every must not be negative, got {a.checkpoint_every}")
     given = parse_settings(a.settings)
     read = configs.read(configs.files(False, a.config))
     for name in a.agents:
@@ -178,9 +160,7 @@ def search_of(a: argparse.Namespace) -> Search:
         search.study(row, env)
     if a.write is not None:
         settings_file.read(a.write)
-    if a.tensorboard is not None:
-        prepare_events(a.tensorboard)
-    executor_options.check(a)
+    job_options.check(a)
     return search
 
 
@@ -197,8 +177,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     sets = given_sets(search)
     earlier = read(a.known) if a.known else {}
     prepare_folder(a.out)
-    folders = [folder for folder in (a.out, a.tensorboard) if folder is not None]
-    with executor_options.pool_of(a, folders) as pool, at_work():
+    with job_options.pool_of(a, a.out) as pool, at_work():
         from rise_agents.files import sole_user
 
         told = ("python", "-m", "benchmarks.tune", *(sys.argv[1:] if argv is None else argv))

@@ -1,4 +1,4 @@
-"""Where jobs run: the options of command lines that start some, and the pool that they stand for."""
+"""How jobs run: the options of command lines that start some, and the pool that they stand for."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ import os
 import socket
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from rise_agents.cli import prepare_folder
 from rise_agents.workers import THREADS, limit_threads
 
 EXECUTORS = ("local", "ray")
@@ -22,7 +23,13 @@ _PATIENCE = 10.0  # s for the head of a cluster to answer
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """The options that say where jobs run."""
+    """The options that say how and where jobs run."""
+    parser.add_argument(
+        "--workers",
+        type=int,
+        metavar="N",
+        help="jobs at once (default: one per core); results do not depend on it",
+    )
     parser.add_argument(
         "--executor",
         default="local",
@@ -35,10 +42,36 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="head of the Ray cluster (default: what RAY_ADDRESS says, else the cluster that this machine is part of,"
         " else Ray is started here)",
     )
+    parser.add_argument(
+        "--checkpoint-every",
+        type=float,
+        default=15.0,
+        metavar="S",
+        help="seconds between two checkpoints of a training, from which it goes on if interrupted (default: 15)",
+    )
+    parser.add_argument(
+        "--tensorboard",
+        type=Path,
+        metavar="DIR",
+        help="write the figures of every training there as event files, which TensorBoard draws",
+    )
 
 
 def check(arguments: argparse.Namespace) -> None:
-    """Raise ``ValueError`` for options that do not go together, or if Ray is not installed."""
+    """Raise ``ValueError`` for values out of range, options that do not go together, or a package that lacks."""
+    if arguments.workers is not None and arguments.workers < 1:
+        raise ValueError(f"--workers must be at least 1, got {arguments.workers}")
+    if not arguments.checkpoint_every >= 0:
+        raise ValueError(f"--checkpoint-every must not be negative, got {arguments.checkpoint_every}")
+    if arguments.tensorboard is not None:
+        from rise_agents.figures import check_installed
+
+        check_installed()
+        prepare_folder(arguments.tensorboard)
+    _check_executor(arguments)
+
+
+def _check_executor(arguments: argparse.Namespace) -> None:
     from rise_agents.agent import nearest
 
     if arguments.executor not in EXECUTORS:
@@ -91,8 +124,8 @@ def _check_answers(source: str, address: str) -> None:
 
 
 @contextmanager
-def pool_of(arguments: argparse.Namespace, folders: Sequence[Path]) -> Iterator[Callable[..., Any]]:
-    """What makes the pool that was asked for, of a number of workers and a listener; ``folders`` are the run's.
+def pool_of(arguments: argparse.Namespace, out: Path) -> Iterator[Callable[..., Any]]:
+    """What makes the pool that was asked for, of a number of workers and a listener; ``out`` is the run folder.
 
     Raises:
         ValueError: the cluster cannot be used.
@@ -109,6 +142,7 @@ def pool_of(arguments: argparse.Namespace, folders: Sequence[Path]) -> Iterator[
         nodes = sum(node["Alive"] for node in ray.nodes())
         cpus = ray.cluster_resources().get("CPU", 0)
         print(f"Ray: {nodes} node{'s' if nodes > 1 else ''}, {cpus:g} CPUs", file=sys.stderr)
+        folders = [folder for folder in (out, arguments.tensorboard) if folder is not None]
         yield partial(RayPool, ray, folders)
     finally:
         ray.shutdown()
