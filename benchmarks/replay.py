@@ -169,11 +169,12 @@ def _the_row(run: Run, arguments: Any) -> Row:
     envs = run.rows["env"].unique().to_pylist()
     if arguments.env is None and len(envs) > 1:
         raise ValueError(f"--env is missing: the run has {' and '.join(sorted(envs))}")
-    key = {"env": arguments.env or envs[0], "agent": arguments.agent, "train_seed": arguments.seed or 0}
+    env = envs[0] if arguments.env is None else arguments.env
+    key = {"env": env, "agent": arguments.agent, "train_seed": arguments.seed or 0}
     run.find(**key)  # says first of these what there is
     models = list(dict.fromkeys(row["noise_model"] for row in run.select(**key)))
     first = next((model for model in run.noise_models if model in models), models[0])
-    key["noise_model"] = arguments.noise_model or first
+    key["noise_model"] = first if arguments.noise_model is None else arguments.noise_model
     run.find(**key)
     levels = {row["noise_level"] for row in run.select(**key)}
     nearest = min(levels, key=lambda level: (abs(level - 1), level))

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import secrets
+import stat
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -65,6 +67,24 @@ def prepare_folder(out: Path) -> None:
         raise ValueError(f"cannot write to the folder {str(out)!r}: {error.strerror}") from None
 
 
+def prepare_file(path: Path) -> None:
+    """Make the folder of a file that is to be written; raises ``ValueError`` if it could not be written."""
+    prepare_folder(path.parent)
+    try:
+        folder = stat.S_ISDIR(path.stat().st_mode)
+    except FileNotFoundError:
+        return
+    except (OSError, ValueError) as error:  # a name that no file can have
+        raise ValueError(f"cannot write {str(path)[:200]!r}: {getattr(error, 'strerror', error)}") from None
+    if folder:
+        raise ValueError(f"cannot write {str(path)!r}: it is a folder")
+
+
+def one_line(error: Exception) -> str:
+    """What an error says, its line breaks shown as a string shows them: names of files may have some."""
+    return "\\n".join(str(error).splitlines())
+
+
 INTERRUPTED = "interrupted; what is finished is kept, run the command again to go on"
 
 Main = Callable[[Sequence[str] | None], int]
@@ -110,7 +130,9 @@ def command(
                 print(f"\n{name}: {interrupted}", file=sys.stderr)
                 return 130
             except kinds as error:
-                print(f"{name}: {error}", file=sys.stderr)
+                print(f"{name}: {one_line(error)}", file=sys.stderr)
+                if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:
+                    return 2  # such a name can only have been given
                 return next(codes[kind] for kind in type(error).__mro__ if kind in codes)
 
         return ending

@@ -244,7 +244,10 @@ def parser() -> Parser:
     p.add_argument("--noise-model", default="step", metavar="MODEL", help="of the readings (default: step)")
     p.add_argument("--noise-level", type=float, default=1.0, metavar="X", help="of that noise (default: 1)")
     p.add_argument(
-        "--rate", type=float, metavar="N", help="steps per second (default: as the environment says)"
+        "--rate",
+        type=float,
+        metavar="N",
+        help="steps per second, 0: as fast as they are drawn (default: as the environment says)",
     )
     p.add_argument(
         "--seed", type=int, default=0, metavar="N", help="range of training seeds, 0 to 999 (default: 0)"

@@ -67,7 +67,12 @@ def _of_name(name: str) -> ModuleType:
     if not all(part.isidentifier() for part in name.split(".")):
         raise ValueError(f"--import takes names of modules and paths of .py files, got {name[:200]!r}")
     _add_folder(Path.cwd())
-    return _import(name, name)
+    module = _import(name, name)
+    if getattr(module, "__file__", None) is None and hasattr(module, "__path__"):
+        raise ValueError(
+            f"--import {name}: {next(iter(module.__path__))} is a folder without __init__.py: name a module in it"
+        )
+    return module
 
 
 def _add_folder(folder: Path) -> None:

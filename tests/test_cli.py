@@ -69,6 +69,15 @@ def test_mistakes_are_one_line(argv, message, capsys):
     assert message in error and error.count("\n") == 1
 
 
+def test_a_name_with_a_line_break_takes_one_line(capsys):
+    @command("x")
+    def main(argv):
+        raise ValueError("a\nb: cannot be read")
+
+    assert main([]) == 2
+    assert capsys.readouterr().err == "x: a\\nb: cannot be read\n"
+
+
 def test_an_interruption_is_told_by_the_exit_code(monkeypatch):
     def interrupted(argv):
         raise KeyboardInterrupt

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.cli import COMMANDS
 from benchmarks.faults import (
     checkpoints,
     covered,
@@ -31,6 +32,7 @@ from benchmarks.faults import (
 )
 from benchmarks.faults.__main__ import main
 from benchmarks.faults.measure import Effort, Fault, Findings, Result, Row, Target, Unavailable
+from benchmarks.faults.programs import PROGRAMS, name_of
 from benchmarks.faults.rows import ROWS
 from rise_agents import demonstrations
 
@@ -565,6 +567,15 @@ def test_fuzz(effort):
     found = fuzz.portion(list(range(120)), effort)
     wrong = [fault for _, faults in found for fault in faults if fault.kind != "slow"]
     assert len(found) == 120 and wrong == []
+
+
+def test_fuzz_knows_all_command_lines():
+    assert {program.module for program in PROGRAMS} == {
+        command.module.removesuffix(".__main__") for command in COMMANDS.values()
+    }
+    for program in PROGRAMS:
+        names = {name_of(option) for option in program.options()}
+        assert names >= {*program.valid, *program.beside, *program.endless}
 
 
 def test_fuzz_in_a_process_of_its_own(effort):

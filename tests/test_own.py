@@ -332,6 +332,13 @@ def test_files_that_cannot_be_found_by_their_name(tmp_path):
             import_modules([name])
 
 
+def test_a_folder_is_no_module(tmp_path, monkeypatch):
+    (tmp_path / "examples_of_my_lab").mkdir()
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=r"--import examples_of_my_lab: .* is a folder without __init__\.py"):
+        import_modules(["examples_of_my_lab"])
+
+
 def test_a_module_is_found_in_the_working_directory(tmp_path, monkeypatch):
     (tmp_path / "of_my_lab.py").write_text("import helper_of_my_lab\n")
     (tmp_path / "helper_of_my_lab.py").touch()

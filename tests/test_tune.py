@@ -298,6 +298,9 @@ def test_a_file_that_is_no_toml_is_refused_before_any_work(tmp_path, capsys, mon
         assert main(["--agents", "pcbc", "--write", "settings.toml"]) == 2
         error = capsys.readouterr().err
         assert says in error and "settings.toml" in error and error.count("\n") == 1
+    for name in ("settings.toml/x", "x" * 300):
+        assert main(["--agents", "pcbc", "--write", name]) == 2
+        assert capsys.readouterr().err.count("\n") == 1
     assert {path.name for path in tmp_path.iterdir()} == {"settings.toml"}
 
 

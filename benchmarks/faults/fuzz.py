@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
 import io
 import json
 import subprocess
 import sys
 import time
-from argparse import Action
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -20,6 +18,7 @@ import numpy as np
 from benchmarks.faults import hostile
 from benchmarks.faults.checkpoints import wrong_values
 from benchmarks.faults.measure import Effort, Fault, Findings, Tell
+from benchmarks.faults.programs import PROGRAMS, VEHICLE, Program, name_of, words
 from benchmarks.faults.training import BENCHMARKED
 from rise_agents import AGENTS, agent_class, make_agent
 
@@ -27,65 +26,24 @@ LIMIT = 1.0  # s
 _CONFIGS = (3, 6, 9)  # last digits of the trials that are settings
 _REAL = 100  # one command line in so many is given to a process of its own
 _PATIENCE = 30.0  # s
-NAMES = ("", " ", "x", "RISE", "expertt", "é" * 40, "名前", "\U0001f916", "a\nb", "\x00", "x" * 100_000, "-", "=",
-         "rise;ls", "$(ls)", "../..", "%s%n", "{0}", "[bold]x[/]", "None", "\udcff", "rise pcbc", "rise\r")  # fmt: skip
-NO_WHOLE = ("NaN", "inf", "-inf", "1e400", "1.5", "-1", "-9999999999", "", " ", "abc", "0x10", "1,000", "9" * 5_000,
-            "None", "1e3", "\x00", "1\n2", "--")  # fmt: skip
-NO_NUMBER = ("NaN", "inf", "-inf", "1e400", "-1", "-0.5", "", "abc", "1,5", "None", "0x1p3", "\x00", "--1")
 JSON = ("{}", '{"a": 1}', "NaN", "Infinity", "-Infinity", "1e400", "[[1]]", "[{}]", "[NaN]", "[null]",
         "[" * 3_000, "9" * 5_000, '"' + "x" * 10_000 + '"', '{"a":' * 3_000)  # fmt: skip
 
-
-class Program(NamedTuple):
-    """A command line.
-
-    Attributes:
-        module: for ``python -m``.
-        valid: arguments with which it would start; the folder is added.
-        required: names of options that must be there.
-    """
-
-    module: str
-    valid: tuple[str, ...]
-    required: tuple[str, ...] = ()
-
-    @property
-    def name(self) -> str:
-        """Of the module that has ``parser`` and ``main``."""
-        return self.module if self.module == "benchmarks.run" else f"{self.module}.__main__"
-
-    def options(self) -> list[Action]:
-        """All options but ``--help``."""
-        return [a for a in importlib.import_module(self.name).parser()._actions if a.dest != "help"]
-
-    def main(self, argv: Sequence[str]) -> int:
-        """In this process."""
-        return importlib.import_module(self.name).main(argv)
-
-
-PROGRAMS = (
-    Program("benchmarks.run", ("--preset", "smoke")),
-    Program("benchmarks.speed", ("--quick", "--rows", "memory")),
-    Program("benchmarks.fidelity", ("--quick",)),
-    Program("benchmarks.faults", ("--quick", "--rows", "save-load")),
-    Program("rise_agents.demonstrations", ("--env", "RISE-GroundVehicle-v0"), ("--env", "--out")),
-)
-# option -> texts that it must refuse
-_TEXTS: dict[str, tuple[str, ...]] = {
-    "--agents": NAMES, "--envs": NAMES, "--env": NAMES, "--preset": NAMES, "--expert": NAMES, "--rows": NAMES,
-    "--filter": NAMES, "--import": NAMES,
-    "--noise-model": (*NAMES, "step+", "+step", "dropout:2", "dropout:x", "delay:-1", "step:1:2", "delay:nan"),
-    "--device": (*NAMES, "cuda:99", "cpu:-1", "meta:x"),
-    "--minari": ("", "x", "a/b", "a b/c-v0", "/", "../x-v0", "x-v", "x" * 300 + "-v0x", "\x00", "a\nb"),
-    "--noise-levels": NO_NUMBER,
-    "--hours": (*NO_NUMBER, "0"),
-    "--share": (*NO_NUMBER, "0", "1.01"),
-    "--checkpoint-every": tuple(text for text in NO_NUMBER if text not in ("inf", "1e400")),
-}  # fmt: skip
-_WHOLE = ("--seeds", "--episodes", "--demos", "--workers", "--repeats", "--seed", "--only")
-_PATHS = ("--out", "--docs", "--config", "--published", "--tensorboard")
-
 Line = list[str]
+
+
+class Places(NamedTuple):
+    """Folders of trials: one to write to, and one of a run."""
+
+    place: Path
+    run: Path
+
+
+class Wrong(NamedTuple):
+    """What is wrong in a command line, and the names of what else is not to be in it; None: of all but some."""
+
+    line: Line
+    instead: tuple[str, ...] | None = ()
 
 
 def pick(rng: np.random.Generator, things: Sequence[Any]) -> Any:
@@ -110,7 +68,7 @@ def bad_path(rng: np.random.Generator, place: Path) -> str:
     )
 
 
-def unknown_option(rng: np.random.Generator, program: Program, place: Path) -> Line:
+def unknown_option(rng: np.random.Generator, program: Program, places: Places) -> Wrong:
     """The name of an option with a slip in it."""
     known = [option for action in program.options() for option in action.option_strings]
     while True:
@@ -127,34 +85,31 @@ def unknown_option(rng: np.random.Generator, program: Program, place: Path) -> L
             name[at] = pick(rng, "xq_é7\n")
         text = "".join(name)
         if text not in (*known, "--", "--help", "--hel", "--h", "--he") and text.startswith("--"):
-            return [text, *pick(rng, ([], ["1"], ["x", "y"]))]
+            return Wrong([text, *pick(rng, ([], ["1"], ["x", "y"]))])
 
 
-def missing_value(rng: np.random.Generator, program: Program, place: Path) -> Line:
+def missing_value(rng: np.random.Generator, program: Program, places: Places) -> Wrong:
     """An option at the end, without what it takes."""
-    takers = [a for a in program.options() if a.nargs != 0]
-    return [pick(rng, takers).option_strings[0]]
+    name = name_of(pick(rng, [a for a in program.options() if a.nargs != 0 and a.option_strings]))
+    return Wrong([name], (name,))
 
 
-def bad_value(rng: np.random.Generator, program: Program, place: Path) -> Line:
+def bad_value(rng: np.random.Generator, program: Program, places: Places) -> Wrong:
     """An option with a value that it cannot have."""
-    names = [a.option_strings[0] for a in program.options()]
-    option = pick(rng, [name for name in names if name in (*_PATHS, *_WHOLE, *_TEXTS)])
-    if option in _PATHS:
-        return [option, bad_path(rng, place)]
-    if option in _WHOLE:
-        return [option, pick(rng, NO_WHOLE)]
-    return [option, pick(rng, _TEXTS[option])]
+    option = pick(rng, [a for a in program.options() if a.type is Path or program.refused(a)])
+    text = bad_path(rng, places.place) if option.type is Path else pick(rng, program.refused(option))
+    name = name_of(option)
+    return Wrong([name, text] if option.option_strings else [text], (name,))
 
 
-def too_many(rng: np.random.Generator, program: Program, place: Path) -> Line:
+def too_many(rng: np.random.Generator, program: Program, places: Places) -> Wrong:
     """Words that belong to no option, or a value for a switch."""
-    switches = [a.option_strings[0] for a in program.options() if a.nargs == 0]
+    switches = [name_of(a) for a in program.options() if a.nargs == 0]
     word = pick(rng, ("run", "é", "x" * 10_000, "RISE-GroundVehicle-v0", "0", "a\nb", "\U0001f916"))
-    return pick(rng, ([word], [pick(rng, switches), word] if switches else [word], ["--", word]))
+    return Wrong(pick(rng, ([word], [pick(rng, switches), word] if switches else [word], ["--", word])))
 
 
-def bad_setting(rng: np.random.Generator, program: Program, place: Path) -> Line:
+def bad_setting(rng: np.random.Generator, program: Program, places: Places) -> Wrong:
     """``--set`` with an unknown agent or field, hostile JSON, or another form."""
     agent = pick(rng, list(AGENTS))
     settings = fields(agent_class(agent).Config)
@@ -187,64 +142,32 @@ def bad_setting(rng: np.random.Generator, program: Program, place: Path) -> Line
         text = f"{agent}.{field.name}={pick(rng, [*wrong, *JSON])}"
         if isinstance(field.default, str):
             text = f"{agent}.{field.name}={pick(rng, wrong)}"
-    return ["--agents", agent, "--set", text]
+    return Wrong(["--agents", agent, "--set", text], ("--agents", "--set"))
 
 
-def conflict(rng: np.random.Generator, program: Program, place: Path) -> Line:
+def conflict(rng: np.random.Generator, program: Program, places: Places) -> Wrong:
     """Options that each make sense, but not together or not here."""
-    lines: dict[str, list[Line]] = {
-        "benchmarks.run": [
-            ["--agents", "rise", "--envs", "RISE-GroundVehicle-v0", "--expert", "pcbc"],
-            ["--agents", "cppo", "--set", "cppo.n_envs=3", "cppo.n_steps=5", "cppo.batch_size=7"],
-            ["--noise-levels", "1", "-1"],
-            ["--agents", "rise", "nobody"],
-        ],
-        "benchmarks.speed": [["--render"], ["--rows", "memory", "no-such"], ["--docs", str(place / "no.md")]],
-        "benchmarks.fidelity": [["--episodes", "2"], ["--docs", str(place / "no.md")]],
-        "benchmarks.faults": [
-            ["--quick", "--share", "0.5"],
-            ["--only", "3"],
-            ["--only", "3", "--rows", "fuzz", "replay"],
-            ["--rows", "fuzz", "--render"],
-            ["--docs", str(place / "no.md")],
-        ],
-        "rise_agents.demonstrations": [
-            ["--expert", "panda"],
-            ["--seed", "1000"],
-            ["--episodes", "99999999999"],
-            ["--minari", "no version"],
-        ],
-    }
-    return pick(rng, lines[program.module])
+    line = pick(rng, program.conflicts).format(**places._asdict()).split("|")
+    return Wrong(line, None)
 
 
-KINDS: tuple[Callable[[np.random.Generator, Program, Path], Line], ...] = (
+KINDS: tuple[Callable[[np.random.Generator, Program, Places], Wrong], ...] = (
     unknown_option, missing_value, bad_value, bad_value, too_many, conflict,
 )  # fmt: skip
 
 
-def command_line(rng: np.random.Generator, place: Path) -> tuple[Program, Line]:
+def command_line(rng: np.random.Generator, places: Places) -> tuple[Program, Line]:
     """A program and arguments of which at least one is wrong, among others that are right."""
     program = pick(rng, PROGRAMS)
-    kinds = (*KINDS, bad_setting, bad_setting) if program.module == "benchmarks.run" else KINDS
-    kind = pick(rng, kinds)
-    wrong = kind(rng, program, place)
+    settings = (bad_setting,) if program.module in ("benchmarks.run", "benchmarks.tune") else ()
+    wrong = pick(rng, (*KINDS, *settings, *settings))(rng, program, places)
     # A valid one must not come after a wrong one of the same name and take its place.
-    valid = [] if kind is conflict else _without(program.valid, wrong)
-    if kind is conflict and "--env" in program.required:
-        valid = list(program.valid)
-    out = [] if "--out" in wrong else ["--out", str(place / "out")]
-    return program, [*valid, *out, *wrong]
-
-
-def _without(valid: Sequence[str], wrong: Line) -> Line:
-    """Valid arguments but those whose option is in ``wrong`` too."""
-    kept: Line = []
-    keep = True
-    for word in valid:
-        keep = word not in wrong if word.startswith("--") else keep
-        kept += [word] if keep else []
-    return kept
+    names = [
+        name for name in program.valid
+        if (name in program.beside if wrong.instead is None else name not in wrong.instead)
+    ]  # fmt: skip
+    valid = [word for name in names for word in words(name, program.valid[name], *places)]
+    return program, [*valid, *wrong.line]
 
 
 def complaint(code: Any, output: str, errors: str, seconds: float | None) -> list[tuple[str, str]]:
@@ -328,13 +251,14 @@ def portion(numbers: list[int], effort: Effort) -> list[tuple[int, list[Fault]]]
     """Some trials in this process."""
     found = []
     with effort.scratch(f"from-{numbers[0]}") as place:
-        _warm_up(place)
+        places = Places(place, a_run(effort))
+        _warm_up(places)
         for number in numbers:
             rng = effort.rng(number)
             if number % 10 in _CONFIGS:
                 found.append((number, configuration(rng)))
                 continue
-            program, argv = command_line(rng, place)
+            program, argv = command_line(rng, places)
             found.append((number, _faults(in_process(program, argv), program, argv)))
     return found
 
@@ -346,20 +270,35 @@ def _faults(wrong: list[tuple[str, str]], program: Program, argv: Line) -> list[
 def in_processes(numbers: list[int], effort: Effort) -> Iterator[tuple[int, list[Fault], float]]:
     """Some trials in a process each, one after the other; also says how long each took."""
     with effort.scratch("processes") as place:
+        places = Places(place, a_run(effort))
         for number in numbers:
-            program, argv = command_line(effort.rng(number), place)
+            program, argv = command_line(effort.rng(number), places)
             wrong, seconds = real_process(program, argv)
             yield number, _faults(wrong, program, argv), seconds
 
 
-def _warm_up(place: Path) -> None:
+def a_run(effort: Effort) -> Path:
+    """The folder of a small run, which is made if it is not there."""
+    folder = effort.folder / f"{effort.row}-run"
+    if not (folder / "run.json").exists():
+        line = "--preset smoke --agents random --noise-levels 1 --episodes 2 --no-videos --workers 1".split()
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()) as errors:
+            code = PROGRAMS[0].main([*line, "--envs", VEHICLE, "--out", str(folder)])
+        if code != 0:
+            raise OSError(f"cannot make a run to try command lines on: {errors.getvalue()}")
+    return folder
+
+
+def _warm_up(places: Places) -> None:
     """Import what the programs import: its time counts for processes of their own only."""
     for name in AGENTS:
         agent_class(name)
     for program in PROGRAMS:
-        in_process(program, [*program.valid, "--out", str(place / "out"), "--no-such-option"])
-        in_process(program, [*program.valid, "--out", str(place / "out"), "--docs", str(place / "no.md")])
-    in_process(PROGRAMS[0], ["--set", "rise.no_such=1", "--out", str(place / "out")])
+        valid = [word for name, value in program.valid.items() for word in words(name, value, *places)]
+        in_process(program, [*valid, "--no-such-option"])
+        for line in program.conflicts:
+            in_process(program, line.format(**places._asdict()).split("|"))
+    in_process(PROGRAMS[0], ["--set", "rise.no_such=1", "--out", str(places.place / "out")])
 
 
 def run(effort: Effort, tell: Tell) -> Findings:
@@ -368,6 +307,7 @@ def run(effort: Effort, tell: Tell) -> Findings:
     numbers = list(effort.numbers(10_000, 10))
     real = [number for number in numbers if number % _REAL == 0]
     inside = [number for number in numbers if number % _REAL]
+    a_run(effort)  # once, not in every process
     size = max(1, -(-len(inside) // (4 * effort.workers)))
     tasks = [(inside[i : i + size], effort) for i in range(0, len(inside), size)]
     for done, (_, found) in enumerate(effort.each(portion, tasks)):

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from benchmarks import job_options
 from benchmarks.run import parse_settings
 from rise_agents import AGENTS
-from rise_agents.cli import INTERRUPTED, Parser, at_work, command, prepare_folder
+from rise_agents.cli import INTERRUPTED, Parser, at_work, command, prepare_file, prepare_folder
 
 if TYPE_CHECKING:
     from benchmarks.tune.search import Search
@@ -160,6 +160,7 @@ def search_of(a: argparse.Namespace) -> Search:
         search.study(row, env)
     if a.write is not None:
         settings_file.read(a.write)
+        prepare_file(a.write)
     job_options.check(a)
     return search
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from rise_agents.agent import nearest
 from rise_agents.checkpoint import CheckpointError
-from rise_agents.cli import Parser, WorkFailed, at_work, command, prepare_folder
+from rise_agents.cli import Parser, WorkFailed, at_work, command, prepare_file
 from rise_agents.runtime import log
 from rise_agents.runtime.loop import ControlLoop, Mind, Monotonic
 from rise_agents.runtime.policies import load_policy, warm_up
@@ -88,7 +88,7 @@ def _checked(a: Any) -> tuple[Rules, Limits, float]:
     rate = None if a.rate_limit is None else np.array(a.rate_limit)
     limits = Limits(space.low.astype(np.float64), space.high.astype(np.float64), rate)
     if a.log is not None:
-        prepare_folder(a.log.parent)
+        prepare_file(a.log)
     return Rules(a.stale_after, a.overruns, a.resume_after), limits, period
 
 

@@ -128,6 +128,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         with socket.socket(family, socket.SOCK_DGRAM) as out:
             count = send(source, lambda data: _to(out, data, to), a.rate, a.seconds)
+    except socket.gaierror as error:
+        raise ValueError(f"--to {a.to}: {error.strerror}") from None
     except OSError as error:
         raise WorkFailed(f"cannot send to {a.to}: {error.strerror}") from None
     print(f"{count:,} datagrams sent to {to[0]}:{to[1]}")

@@ -195,6 +195,6 @@ def address(text: str) -> tuple[str, int]:
     """``HOST:PORT`` or ``PORT``, which is on loopback; raises ``ValueError`` for anything else."""
     host, _, port = text.rpartition(":")
     host = host.strip("[]") or LOOPBACK
-    if not (port.isascii() and port.isdecimal() and int(port) < 65_536):
+    if "\0" in host or not (port.isascii() and port.isdecimal() and int(port) < 65_536):
         raise ValueError(f"an address must be PORT or HOST:PORT, got {text!r}")
     return host, int(port)
