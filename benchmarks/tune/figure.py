@@ -55,7 +55,12 @@ def figure(
         axis.set_xlim(left - 0.2, 100.3)
         every = [rates for (_, of), trials in marks.items() if of == env for rates, _ in trials.values()]
         if lost := sum(100 * rates.clean < left for rates in every):
-            axis.text(0.02, 0.02, f"← {lost} further left", transform=axis.transAxes, size=10, color=FAINT)
+            where = {
+                "transform": axis.transAxes,
+                "ha": "right",
+                "va": "bottom",
+            }  # beside the title: no mark is there
+            axis.text(1.0, 1.02, f"← {lost} further left", size=10, color=FAINT, **where)
         _limit(axis, 100 * (best[env].clean - clean_loss))
         style(axis, env_label(env))
         axis.set(xlabel="on true readings", ylabel="at noise level 1")
