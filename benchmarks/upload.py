@@ -14,7 +14,7 @@ from typing import Any
 from benchmarks import report, results
 from benchmarks.html_report import curve
 from benchmarks.labels import count, split_row
-from rise_agents.cli import Parser, at_work, command
+from rise_agents.cli import Parser, WorkFailed, command
 
 _EXAMPLES = """\
 examples:
@@ -111,7 +111,7 @@ def _rates(path: Path) -> _Rates:
 
 def send(
     trainings: Sequence[Tracked], folder: Path, project: str, entity: str = "", offline: bool = False
-) -> None:
+) -> bool:
     """Write trainings to Weights & Biases, a run each, in a group per environment.
 
     Args:
@@ -119,10 +119,14 @@ def send(
         folder: where its own files go.
         project: of Weights & Biases.
         entity: user or team; empty: as its configuration says.
-        offline: whether the files stay there until ``wandb sync`` sends them.
+        offline: whether the files stay there until ``wandb sync`` sends them; False: as its configuration says.
+
+    Returns:
+        Whether they do.
     """
     import wandb
 
+    stay = offline
     for each in trainings:
         run = wandb.init(
             project=project,
@@ -133,14 +137,16 @@ def send(
             group=each.env,
             job_type=each.agent,
             config=each.config,
-            mode="offline" if offline else "online",
+            mode="offline" if offline else None,
             resume=None if offline else "allow",
             settings=wandb.Settings(silent=True),
         )
+        stay = bool(run.offline)
         for step, figures in each.curve:
             run.log(figures, step=step)
         run.summary.update(each.summary)
         run.finish()
+    return stay
 
 
 def parser() -> Parser:
@@ -168,9 +174,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         raise ValueError(f"{str(a.run)!r} has no training that has ended")
     if importlib.util.find_spec("wandb") is None:
         raise ValueError("this needs one more package: pip install 'rise-suite[wandb]'")
-    with at_work(Exception):  # of a library that has many kinds, most of a network
-        send(trainings, a.run, a.project, a.entity, a.offline)
-    where = f"{a.run / 'wandb'}: wandb sync sends it" if a.offline else f"project {a.project}"
+    try:
+        stay = send(trainings, a.run, a.project, a.entity, a.offline)
+    except Exception as error:  # of a library that has many kinds, most of a network
+        why = " ".join(str(error).split())
+        raise WorkFailed(why if a.offline else f"{why}; with --offline it goes into files first") from error
+    where = f"{a.run / 'wandb'}: wandb sync sends it" if stay else f"project {a.project}"
     print(f"{count([len(trainings)], 'training')} in {where}")
     return 0
 

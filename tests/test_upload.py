@@ -51,17 +51,18 @@ class Library:
     """Stands in for the module ``wandb``."""
 
     def __init__(self, refuses=False):
-        self.runs, self.refuses = [], refuses
+        self.runs, self.refuses, self.configured = [], refuses, "online"
 
     def Settings(self, **how):  # their name
         return how
 
     def init(self, **how):
         if self.refuses:
-            raise ConnectionError("no route to it")
+            raise ConnectionError("no route\nto it")
         run = SimpleNamespace(how=how, logged=[], summary={}, ended=False)
         run.log = lambda figures, step: run.logged.append((step, figures))
         run.finish = lambda: setattr(run, "ended", True)
+        run.offline = (how["mode"] or self.configured) == "offline"
         self.runs.append(run)
         return run
 
@@ -79,7 +80,7 @@ def test_every_training_has_its_settings_curve_and_rates(run, library, capsys):
     assert capsys.readouterr().out == "2 trainings in project mine\n"
     rise, cppo = library.runs
     assert rise.how["id"] == f"rise-seed0-abc-{VEHICLE}" and rise.how["name"] == "rise, seed 0"
-    assert (rise.how["project"], rise.how["mode"], rise.how["resume"]) == ("mine", "online", "allow")
+    assert (rise.how["project"], rise.how["mode"], rise.how["resume"]) == ("mine", None, "allow")
     told = {"env": VEHICLE, "agent": "rise", "seed": 0, "learned from": "24 mixture episodes", "beta": 0.07}
     assert rise.how["config"] == told
     assert rise.logged == [(500, {"loss": 2.0}), (1_000, {"loss": 1.0})]  # thousandths: it takes no steps
@@ -104,6 +105,13 @@ def test_offline_it_writes_into_the_run_folder(run, library, capsys):
     assert "wandb sync sends it" in capsys.readouterr().out
 
 
+def test_its_own_word_for_offline_holds(run, library, capsys):
+    """``WANDB_MODE=offline``, or ``wandb offline``, which the library reads where no mode is given."""
+    library.configured = "offline"
+    assert upload.main([str(run), "--project", "mine"]) == 0
+    assert "wandb sync sends it" in capsys.readouterr().out
+
+
 def test_what_cannot_be_uploaded_is_one_line(run, tmp_path, library, monkeypatch, capsys):
     def refused(says, *arguments, code=2):
         assert upload.main([str(argument) for argument in arguments]) == code
@@ -113,7 +121,7 @@ def test_what_cannot_be_uploaded_is_one_line(run, tmp_path, library, monkeypatch
     refused("not the folder of a run", tmp_path / "no", "--project", "x")
     refused("--project", run)
     library.refuses = True
-    refused("no route to it", run, "--project", "x", code=1)
+    refused("no route to it; with --offline", run, "--project", "x", code=1)
     monkeypatch.setattr(upload.importlib.util, "find_spec", lambda name: None)
     refused("rise-suite[wandb]", run, "--project", "x")
     (run / "agents" / VEHICLE / "rise-seed0-abc.json").write_text("{}")
