@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import signal
 from dataclasses import replace
 
 import gymnasium as gym
@@ -16,7 +17,7 @@ from runtime_parts import LIMITS, PANDA, TASK, VEHICLE, C, Clock, Policy, Readin
 
 from rise_agents import make_agent
 from rise_agents.rollout import rollout
-from rise_agents.runtime import ControlLoop, EnvRobot, Limits, Reading, Rules, log
+from rise_agents.runtime import ControlLoop, EnvRobot, Limits, Observed, Reading, Rules, log, streams
 from rise_agents.runtime.__main__ import main
 from rise_agents.runtime.loop import Mind, Monotonic
 from rise_agents.runtime.replay import decide_again
@@ -184,6 +185,16 @@ def test_what_passes_may_end_a_stop_but_no_error_of_the_policy(name):
     np.testing.assert_array_equal(robot.times("apply"), start + T * np.array(expected))
 
 
+def test_who_lets_a_going_robot_go_on_does_not_undo_a_stop_to_come():
+    """Two people press the button, or one twice: the next error of the policy waits for a person all the same."""
+    clock, loop, robot, _ = in_trouble("policy")
+    start = clock.time
+    clock.at = [(start + 1.5 * T, loop.restart)]
+    loop.run(12 * T)
+    assert loop.watchdog.stopped.kind == "policy"
+    np.testing.assert_array_equal(robot.times("apply"), start + T * np.arange(3))
+
+
 def test_a_state_that_is_not_finite():
     clock = Clock()
     robot = Robot(clock)
@@ -244,6 +255,19 @@ def test_a_robot_that_fails_ends_the_run_and_is_told_to_stop(fails):
     loop.run(10 * T)
     assert loop.watchdog.stopped.kind == "robot" and clock.time < 64.0 + 2 * T
     assert robot.told[-1][1] == "stop" and not robot.times("apply")
+
+
+def test_a_robot_that_cannot_be_told_to_stop_ends_the_run_with_a_log():
+    clock = Clock()
+    robot = Robot(clock)
+    loop = make(clock, robot=robot)
+
+    def stop():
+        raise OSError("no answer")
+
+    robot.stop = stop
+    loop.run(3 * T)
+    assert str(loop.watchdog.stopped) == "robot: OSError: no answer" and len(loop.recorder.log()) == 3
 
 
 def test_an_interruption_stops_the_robot_and_keeps_what_happened():
@@ -464,6 +488,42 @@ def test_noise_is_drawn_once_for_a_reading():
     assert (NoisyStream(true, TASK, "step", 0.0, 3).latest().obstacle == C).all()
 
 
+def test_noise_is_ready_before_the_first_period(monkeypatch):
+    """What is compiled or loaded for a first draw takes longer than a period."""
+    drawn = []
+
+    class Noted(streams.NoiseRows):
+        def start(self, *arguments):
+            drawn.append("start")
+            return super().start(*arguments)
+
+    monkeypatch.setattr(streams, "NoiseRows", Noted)
+    NoisyStream(RobotReadings(None), TASK, "step", 1.0, 3)
+    assert drawn == ["start"]
+
+
+class Given:
+    """A stream of one reading."""
+
+    def __init__(self, reading):
+        self.latest = lambda: reading
+
+
+@pytest.mark.parametrize("env_id", [VEHICLE, PANDA])
+def test_a_virtual_obstacle_that_is_read_with_a_radius_below_zero_is_no_failure_of_the_robot(env_id):
+    """Noise does that to a reading, and a recorded run is sent as it was read."""
+    clock, task = Clock(), task_of(env_id)
+    goal, c = np.zeros(task.dim), np.append(np.full(task.widths["obstacle"] - 1, 0.3), -0.5)
+    robot = EnvRobot(env_id, clock, follow=Given(Reading(c, clock.now(), 1, goal)))
+    for _ in range(2):
+        seen = robot.observe()
+        robot.stop()
+    assert np.isfinite(seen.clearance)
+    np.testing.assert_array_equal(seen.goal, goal)
+    assert c[-1] == -0.5
+    robot.close()
+
+
 def test_a_vehicle_s_obstacle_can_be_placed():
     """Clearance of a step, of a vehicle at rest from a disc that comes nearer, in closed form."""
     env = gym.make(VEHICLE).unwrapped
@@ -535,9 +595,12 @@ def test_the_command_runs_keeps_and_replays(agent, tmp_path, capsys):
     assert "  go" in told and "differ by 0.0e+00" in told
 
 
-def test_a_run_that_cannot_be_kept_is_told(agent, tmp_path, capsys):
+def test_a_run_that_cannot_be_kept_is_told(agent, tmp_path, capsys, monkeypatch):
+    def full(path, found):
+        raise OSError(28, "No space left on device", str(path))
+
+    monkeypatch.setattr(log, "write", full)
     agent.save(tmp_path / "agent.rise")
-    (tmp_path / "run.parquet").mkdir()
     arguments = ["--agent", str(tmp_path / "agent.rise"), "--env", VEHICLE, "--seconds", "0.2"]
     assert main([*arguments, "--log", str(tmp_path / "run.parquet")]) == 1
     told = capsys.readouterr().err
@@ -555,6 +618,39 @@ def test_a_robot_that_fails_is_told_and_the_run_is_kept(agent, tmp_path, capsys,
     told = capsys.readouterr().err
     assert told.startswith("rise_agents.runtime: ") and "no answer from the drive" in told
     assert len(log.read(tmp_path / "run.parquet")) == 0
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("first", [False, True])
+def test_a_log_is_kept_though_a_signal_comes_while_it_is_written(agent, tmp_path, monkeypatch, number, first):
+    """As the second Ctrl-C of somebody in a hurry, or a kill as the run ends."""
+    written = log.write
+    handlers = [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)]
+
+    def write(path, found):
+        signal.raise_signal(number)
+        written(path, found)
+
+    def observe(self):
+        if first:
+            signal.raise_signal(number)
+        return Observed(np.zeros(3), np.zeros(2))
+
+    def stop(self):
+        if first:
+            signal.raise_signal(number)
+        told.append("stop")
+
+    told = []
+    monkeypatch.setattr(log, "write", write)
+    monkeypatch.setattr(EnvRobot, "observe", observe)
+    monkeypatch.setattr(EnvRobot, "stop", stop)
+    agent.save(tmp_path / "agent.rise")
+    arguments = ["--agent", str(tmp_path / "agent.rise"), "--env", VEHICLE, "--seconds", "0.2"]
+    code = main([*arguments, "--log", str(tmp_path / "run.parquet")])
+    assert code == (130 if first else 0) and told[-1] == "stop"
+    assert len(log.read(tmp_path / "run.parquet")) == (0 if first else 2)
+    assert handlers == [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)]
 
 
 @pytest.mark.parametrize(

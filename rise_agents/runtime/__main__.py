@@ -92,18 +92,27 @@ def _checked(a: Any) -> tuple[Rules, Limits, float]:
     return Rules(a.stale_after, a.overruns, a.resume_after), limits, period
 
 
+_POLITE = (signal.SIGINT, signal.SIGTERM)
+
+
+def _handle(how: Any) -> list[Any]:
+    return [signal.signal(number, how) for number in _POLITE]
+
+
 @contextmanager
-def _terminated_as_interrupted() -> Iterator[None]:
-    """A polite kill stops the robot and keeps the log, as Ctrl-C does."""
+def _interrupted_once() -> Iterator[None]:
+    """Ctrl-C and a polite kill end the run; another one cuts short neither the robot's stop nor the log."""
 
     def interrupt(*_: Any) -> None:
+        _handle(signal.SIG_IGN)
         raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGTERM, interrupt)
+    before = _handle(interrupt)
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in zip(_POLITE, before, strict=True):
+            signal.signal(number, handler)
 
 
 @command("rise_agents.runtime", bad_input=(CheckpointError, ImportError))
@@ -128,15 +137,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         }
         recorder = log.Recorder(task, len(limits.low), about)
         loop = ControlLoop(mind, robot, stream, task, limits, period, rules, clock, recorder)
-        with at_work():
+        with at_work(), _interrupted_once():
             return _run(loop, a, udp)
 
 
 def _run(loop: ControlLoop, a: Any, udp: UdpStream | None) -> int:
     code = 0
     try:
-        with _terminated_as_interrupted():
-            loop.run(a.seconds)
+        loop.run(a.seconds)
+        _handle(signal.SIG_IGN)
     except KeyboardInterrupt:
         code = 130
     found = loop.recorder.log()

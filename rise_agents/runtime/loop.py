@@ -136,7 +136,7 @@ class ControlLoop:
                 if not self._fatal:
                     self._rest_until(start + periods * self.period)
             finally:
-                self.robot.stop()
+                self._halt()
 
     def _rest_until(self, deadline: float) -> None:
         """Wait for the next period; stop the robot at the moment that its last reading becomes stale."""

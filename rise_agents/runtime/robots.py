@@ -97,7 +97,10 @@ class EnvRobot:
             self._begin()
         external = None if self._follow is None else self._follow.latest()
         if external is not None:
-            self._env.place(external.goal, external.obstacle)
+            obstacles = external.obstacle.reshape(-1, 2 * self.task.dim + 1).copy()
+            # Read with noise, as a recorded run was, a radius may be below zero: hardly anything is there.
+            obstacles[:, -1] = np.maximum(obstacles[:, -1], 1e-9)
+            self._env.place(external.goal, obstacles.ravel())
         if self._steps >= 0:
             self._observation, _, terminated, _, self._info = self._env.step(self._command)
             self._ended = self._follow is None and (terminated or self._steps + 1 >= self._length)

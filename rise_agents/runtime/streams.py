@@ -72,6 +72,7 @@ class NoisyStream:
     def __init__(self, stream: ReadingStream, task: Task, noise: str, level: float, seed: int) -> None:
         model = make_noise(noise, level, task.noise_channels)
         self.stream, self._rows = stream, NoiseRows(model, np.array(task.noise_scale), 1, ahead=64)
+        self._rows.start(np.zeros((1, len(task.noise_scale))), np.ones(1, bool))  # slow the first time only
         self._rows.seed(np.ones(1, bool), [seed])
         self._last: Reading | None = None  # with noise
 

@@ -107,13 +107,15 @@ class Watchdog:
         went = self.stopped is None
         if went and why.kind == WAITING:  # there was one
             why = Stop("stale", "no reading any more")
+        if went:
+            self._restart = False  # who said so before knew nothing of this
         if went or why.kind == "robot":
             self.stopped = why
         self._good_since = None
         return went
 
     def restart(self) -> None:
-        """Go on with the next good reading, whatever the reason was."""
+        """Go on with the next good reading, whatever the reason was; one that goes is not changed."""
         self._restart = True
 
     def resumes(self, now: float) -> bool:
