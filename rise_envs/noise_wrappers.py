@@ -5,14 +5,16 @@ Both follow the same rules.
 - **What is noised.** ``keys`` of a Dict observation (default: ``obstacle``, where there is one), or the whole
   of a Box. Everything else, goals included, passes untouched. Noised parts get the space (−∞, ∞).
 - **How much.** ``noise_level`` × ``noise_scale``, the latter per channel: an argument (a number, an array
-  that broadcasts to the Box, or a dict of these), else the dict ``env.unwrapped.noise_scale`` where the
-  environment publishes one, else 1.
-- **Where.** Groups that a noise text can name (``step@position``) are the argument ``noise_channels``, else the
-  property of this name, by key and group, of the environment: see :meth:`rise_envs.noise_channels.Channels.groups`.
+  that broadcasts to the Box, or a dict of these), else the dict ``noise_scale`` that the environment or a wrapper
+  around it publishes, else 1.
+- **Where.** Groups that a noise text can name (``step@position``) are the argument ``noise_channels``, else what is
+  published under this name, by key and group: see :meth:`rise_envs.noise_channels.Channels.groups`.
 - **Reproducible, and apart from the environment.** ``reset(seed=s)`` seeds the noise's own stream, further
   resets go on with it, and ``reset(options={"noise_seed": n})`` names the noise of one episode whatever the
   seed. The environment's random numbers are not touched: it moves the same with and without noise.
 - **Truth.** ``info["clean_observation"]`` is a copy of the whole observation without noise.
+- **Noise upon noise.** A wrapper around another one draws from a stream of its own; a noise seed is that of the
+  outermost, and the truth that of the innermost.
 """
 
 from __future__ import annotations
@@ -40,10 +42,18 @@ _STREAM, _EPISODE = 0x6E6F6973, 0x65706973
 
 
 class NoiseRows:
-    """The noise of B episodes that run side by side, each with its own key stream and clock."""
+    """The noise of B episodes that run side by side, each with its own key stream and clock.
 
-    def __init__(self, model: NoiseModel, scale: Array, n: int, ahead: int) -> None:
-        self.model, self.scale, self._ahead = model, scale, ahead
+    Args:
+        model: of the noise.
+        scale: unit of each channel, (C,).
+        n: B.
+        ahead: how many steps are drawn at once.
+        layer: how many other noise wrappers there are inside of this one.
+    """
+
+    def __init__(self, model: NoiseModel, scale: Array, n: int, ahead: int, layer: int = 0) -> None:
+        self.model, self.scale, self._ahead, self._layer = model, scale, ahead, layer
         self._stream: Keys = np.random.SeedSequence().generate_state(n, np.uint64)
         self._episode: Keys = np.zeros(n, dtype=np.uint64)
         self._step: Steps = np.zeros(n, dtype=np.int64)
@@ -51,7 +61,7 @@ class NoiseRows:
 
     def seed(self, rows: Rows, seeds: Sequence[int]) -> None:
         """Let the streams of the given rows (B,) begin anew, as ``seeds`` (one for each) name them."""
-        self._stream[rows] = placed(streams.seed_keys(seeds, _STREAM), self._stream)
+        self._stream[rows] = placed(streams.seed_keys(seeds, _STREAM + self._layer), self._stream)
         self._episode[rows] = 0
 
     def start(self, reading: Array, rows: Rows, noise_seeds: Sequence[int] | None = None) -> Array:
@@ -73,7 +83,7 @@ class NoiseRows:
             self._episode[rows] += 1
         else:
             chosen = [noise_seeds[i] for i in np.flatnonzero(rows).tolist()]
-            keys = placed(streams.seed_keys(chosen, _EPISODE), reading)
+            keys = placed(streams.seed_keys(chosen, _EPISODE + self._layer), reading)
         self._step[rows] = 0
         fresh = self.model.reset(keys, reading.shape[1], self._ahead)
         noisy, fresh = self.model(reading[rows], self.scale, self._step[rows], fresh)
@@ -161,9 +171,11 @@ class ObservationNoise(gym.Wrapper, RecordConstructorArgs):
         gym.Wrapper.__init__(self, env)
         self.channels = Channels.of(env.observation_space, keys)
         self.observation_space = self.channels.noisy_space(env.observation_space)
-        scale = self.channels.scale(noise_scale, getattr(env.unwrapped, "noise_scale", None))
-        groups = self.channels.groups(noise_channels, getattr(env.unwrapped, "noise_channels", None))
-        self._rows = NoiseRows(make_noise(noise, noise_level, groups), scale, 1, ahead=64)
+        scale = self.channels.scale(noise_scale, _published(env, "noise_scale"))
+        groups = self.channels.groups(noise_channels, _published(env, "noise_channels"))
+        layer = _published(env, "noise_layers") or 0
+        self._rows = NoiseRows(make_noise(noise, noise_level, groups), scale, 1, ahead=64, layer=layer)
+        self.noise_layers = layer + 1  # this one included: a wrapper around this one asks for it
         named = dict(zip(self.channels.keys or (), self.channels.spans, strict=False))
         self._base: Any = env.unwrapped
         self._obstacle = named.get("obstacle") if hasattr(self._base, "perceived") else None
@@ -200,7 +212,9 @@ class ObservationNoise(gym.Wrapper, RecordConstructorArgs):
     def _hand_out(self, clean: Any, noisy: Array, info: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
         if self._obstacle is not None:
             self._base.perceived = noisy[0, self._obstacle].copy()
-        return self.channels.write(clean, noisy), {**info, "clean_observation": own_copy(clean)}
+        if self.noise_layers == 1:
+            info = {**info, "clean_observation": own_copy(clean)}
+        return self.channels.write(clean, noisy), info
 
 
 class VectorObservationNoise(VectorWrapper, RecordConstructorArgs):
@@ -249,12 +263,12 @@ class VectorObservationNoise(VectorWrapper, RecordConstructorArgs):
         self.channels = Channels.of(env.single_observation_space, keys)
         self.single_observation_space = self.channels.noisy_space(env.single_observation_space)
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
-        scale = self.channels.scale(
-            noise_scale, _published(env, "noise_scale") if noise_scale is None else None
-        )
-        published = _published(env, "noise_channels") if noise_channels is None else None
-        model = make_noise(noise, noise_level, self.channels.groups(noise_channels, published))
-        self._rows = NoiseRows(model, scale, env.num_envs, ahead=1)
+        scale = self.channels.scale(noise_scale, _published(env, "noise_scale"))
+        groups = self.channels.groups(noise_channels, _published(env, "noise_channels"))
+        layer = _published(env, "noise_layers") or 0
+        model = make_noise(noise, noise_level, groups)
+        self._rows = NoiseRows(model, scale, env.num_envs, ahead=1, layer=layer)
+        self.noise_layers = layer + 1
         self._noisy: Array | None = None  # as last handed out
         self._done = np.zeros(env.num_envs, dtype=bool)
 
@@ -321,7 +335,8 @@ class VectorObservationNoise(VectorWrapper, RecordConstructorArgs):
             final_obs = infos["final_obs"].copy()
             for i, observation in finals.items():
                 final_obs[i] = self.channels.write(observation, noisy[i : i + 1])
-                final_info = self._add_info(final_info, {"clean_observation": own_copy(observation)}, i)
+                if self.noise_layers == 1:
+                    final_info = self._add_info(final_info, {"clean_observation": own_copy(observation)}, i)
         else:  # one batch, right in the rows that ended
             noisy = own_copy(self._rows.advance(self.channels.read(infos["final_obs"], (self.num_envs,))))
             final_obs = self.channels.write(infos["final_obs"], noisy, (self.num_envs,))
@@ -331,7 +346,12 @@ class VectorObservationNoise(VectorWrapper, RecordConstructorArgs):
         return noisy, infos
 
     def _clean_info(self, clean: Any, rows: Rows) -> dict[str, Any]:
-        """The clean observations in the form that Gymnasium gives to infos, with masks of who has one."""
+        """The clean observations in the form that Gymnasium gives to infos, with masks of who has one.
+
+        None, where a noise wrapper further inside has given them.
+        """
+        if self.noise_layers > 1:
+            return {}
         values = own_copy(clean)
         rows = placed(rows, next(iter(clean.values())) if isinstance(clean, dict) else clean)
         if isinstance(values, dict):
@@ -339,12 +359,18 @@ class VectorObservationNoise(VectorWrapper, RecordConstructorArgs):
         return {"clean_observation": values, "_clean_observation": own_copy(rows)}
 
 
-def _published(env: VectorEnv, name: str) -> Any:
-    """An attribute as the vector environment or its first sub-environment publishes it, else ``None``."""
-    base = env.unwrapped
-    if hasattr(base, name):
-        return getattr(base, name)
+def _published(env: gym.Env | VectorEnv, name: str) -> Any:
+    """An attribute as the environment, or the outermost wrapper that has it, publishes it, else ``None``.
+
+    Of a vector environment without it: as its first sub-environment does.
+    """
+    if isinstance(env, gym.Env):
+        return env.get_wrapper_attr(name) if env.has_wrapper_attr(name) else None
+    while isinstance(env, VectorWrapper) and not hasattr(env, name):
+        env = env.env
+    if hasattr(env, name):
+        return getattr(env, name)
     # Asking first: an attribute that is missing in a worker process would end that worker.
-    if hasattr(base, "call") and all(base.call("has_wrapper_attr", name)):
-        return base.call("get_wrapper_attr", name)[0]
+    if hasattr(env, "call") and all(env.call("has_wrapper_attr", name)):
+        return env.call("get_wrapper_attr", name)[0]
     return None

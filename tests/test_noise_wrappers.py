@@ -503,3 +503,63 @@ def test_other_wrappers_go_around_it():
     sync = gym.make_vec("RISE-GroundVehicle-v0", 2, vectorization_mode="sync", wrappers=(make,))
     twin = VectorObservationNoise(gym.make_vec("RISE-GroundVehicle-v0", 2), "episode")
     assert_same(twin.reset(seed=3), sync.reset(seed=3))
+
+
+# Wrappers around wrappers
+
+
+class Known(gym.Wrapper):
+    """Somebody's wrapper, who knows how well the sensors of what is inside do."""
+
+    noise_scale = {"observation": [3.0, 4.0]}  # noqa: RUF012
+    noise_channels = {"observation": {"second": [1, 3]}}  # noqa: RUF012
+
+    def __init__(self):
+        super().__init__(BoxWalk())
+
+
+def test_what_a_wrapper_publishes_counts():
+    single = ObservationNoise(gym.wrappers.TimeLimit(Known(), 5), "step@second")
+    batch = VectorObservationNoise(SyncVectorEnv([Known]), "step@second")
+    observation, info = single.reset(seed=0)
+    changed = observation != info["clean_observation"]
+    assert_array_equal(changed, [[False, True], [False, True]])
+    assert_array_equal(single._rows.scale, [3, 4, 3, 4])
+    assert_array_equal(batch.reset(seed=0)[0][0], observation)
+
+
+def twice(env, wrap):
+    """Noise of the same model on two parts, the second a bias on top of the first."""
+    inner = wrap(env, "episode", "desired_goal")
+    return wrap(inner, "episode", ["obstacle", "desired_goal"], noise_scale=1.0)
+
+
+def test_noise_upon_noise_has_a_stream_of_its_own():
+    """Two independent biases of deviation 1 on the goal, and one of deviation 1 on the obstacle."""
+    errors, n = [], 3000
+    env = twice(Walk(), ObservationNoise)
+    for seed in range(n):
+        observation, info = env.reset(seed=seed)
+        goal = observation["desired_goal"] - env.unwrapped.buffer["desired_goal"]
+        errors.append([*goal, *(observation["obstacle"] - env.unwrapped.buffer["obstacle"]).flat])
+        assert_equal(info["clean_observation"], env.unwrapped.buffer)
+    expected = np.diag([2.0, 2, 1, 1, 1, 1])
+    np.testing.assert_allclose(np.cov(np.transpose(errors)), expected, atol=4.5 * 2 * np.sqrt(2 / n))
+
+
+@pytest.mark.parametrize("mode", MODES, ids=str)
+@pytest.mark.parametrize("inside", [0, 1, 2], ids=["both-outside", "one-inside", "both-inside"])
+def test_noise_upon_noise_is_the_same_single_and_batched(inside, mode):
+    def make():
+        env = Walk()
+        for wrapper in range(inside):
+            env = ObservationNoise(env, MODELS[wrapper])
+        return env
+
+    ours = SyncVectorEnv([make] * N, autoreset_mode=mode)
+    for wrapper in range(inside, 2):
+        ours = VectorObservationNoise(ours, MODELS[wrapper])
+    both = SyncVectorEnv(
+        [lambda: ObservationNoise(ObservationNoise(Walk(), MODELS[0]), MODELS[1])] * N, autoreset_mode=mode
+    )
+    assert_same(run(ours, mode, seed=4), run(both, mode, seed=4))
