@@ -25,7 +25,7 @@ class EpisodeStreams:
         own: makes arrays of whatever library out of NumPy's.
     """
 
-    def __init__(self, count: int, own: Callable[[Any], Array] = lambda array: array) -> None:
+    def __init__(self, count: int, own: Callable[[Any], Array] = np.asarray) -> None:
         self._count, self._own = count, own
         self._base: Array = None  # of `streams.seed_bases`
         self._number = own(np.zeros(count, np.int64))  # of the next episode

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from typing import Any
 
@@ -19,6 +20,14 @@ from rise_envs.vehicle_dynamics import packed
 from rise_envs.vehicle_world import Array, Params, World, sample_starts
 
 DEFAULTS = Params()
+
+
+@functools.cache
+def _dynamics() -> Any:
+    """The compiled dynamics: numba is loaded by those who drive only. No attribute, as modules cannot be copied."""
+    from rise_envs import vehicle_compiled
+
+    return vehicle_compiled
 
 
 def _pose(state: Array) -> tuple[Array, Array]:
@@ -184,9 +193,8 @@ class GroundVehicleEnv(VehicleTask, gym.Env):
         # The reading as a noise wrapper last handed it out. A window, which draws within the step, shows the
         # one that the step's action was based on.
         self.perceived: Array | None = None
-        from rise_envs import vehicle_compiled  # numba is loaded by those who drive only
-
-        self._dynamics, self._numbers = vehicle_compiled, packed(self.constants)
+        self._numbers = packed(self.constants)
+        _dynamics()
         self._streams = EpisodeStreams(1)
         self._key = self._time = 0
         self._now: Array | None = None  # x, y, θ, goal, and the reading of each disc
@@ -250,7 +258,7 @@ class GroundVehicleEnv(VehicleTask, gym.Env):
         super().reset(seed=seed)
         self._streams.seed(seed, rng=self.np_random)
         base, number = self._streams.next(np.array([0]))
-        world, (clearance,) = sample_starts(base, number, self.n_obstacles, self.constants, self._dynamics)
+        world, (clearance,) = sample_starts(base, number, self.n_obstacles, self.constants, _dynamics())
         self.world, self.perceived = world, None
         self._trail = [world.state[0, :2]]
         shown = np.concatenate((world.state[0], world.state[0, :2], self._started()[3:], world.state[0, :2]))
@@ -267,7 +275,7 @@ class GroundVehicleEnv(VehicleTask, gym.Env):
         """
         now, (v, omega) = self._started(), finite_numbers(action, (2,))
         shown = np.empty(9 + 5 * self.n_obstacles)
-        clearance, reward, reached = self._dynamics.step_alone(
+        clearance, reward, reached = _dynamics().step_alone(
             now, self._key, self._time, v, omega, self._numbers, shown
         )
         self._time += 1

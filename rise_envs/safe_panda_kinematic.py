@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,14 @@ if TYPE_CHECKING:
     from rise_envs.panda_world import World
 
 Array = NDArray[np.float64]
+
+
+@functools.cache
+def _worlds() -> Any:
+    """The arm's world: numba is loaded by those who make one only. No attribute, as modules cannot be copied."""
+    from rise_envs import panda_world
+
+    return panda_world
 
 
 class SafePandaKinematicEnv(PandaTask, gym.Env):
@@ -82,10 +91,7 @@ class SafePandaKinematicEnv(PandaTask, gym.Env):
         self.perceived: Array | None = None  # where a noise wrapper leaves the reading
         self._streams = EpisodeStreams(1)
         self._world: World | None = None
-        from rise_envs import panda_world  # numba is loaded by those who make an arm only
-
-        self._worlds = panda_world
-        self._constants = panda_world.panda_starts.constants(self.params)
+        self._constants = _worlds().panda_starts.constants(self.params)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -98,7 +104,7 @@ class SafePandaKinematicEnv(PandaTask, gym.Env):
         seed = check_reset(seed, options)
         super().reset(seed=seed)
         self._streams.seed(seed, rng=self.np_random)
-        world = self._worlds.begin(episode_keys(*self._streams.next(np.array([0]))), self._constants)
+        world = _worlds().begin(episode_keys(*self._streams.next(np.array([0]))), self._constants)
         self._world, self.perceived = world, None
         return self._observe(world), self._info(world, world.arms.hand, False)
 
@@ -113,7 +119,7 @@ class SafePandaKinematicEnv(PandaTask, gym.Env):
             raise gym.error.ResetNeeded("call reset() to start an episode")
         before = self._world.arms.hand
         commanded = finite_action(action, self.action_space.shape)
-        world = self._world = self._worlds.advance(self._world, commanded[None], self._constants)
+        world = self._world = _worlds().advance(self._world, commanded[None], self._constants)
         hand, goal = world.arms.hand[0], world.goal[0]
         reached = bool(goals.distance(hand, goal) <= self.params.goal_radius)
         info = self._info(world, before, reached)
@@ -122,10 +128,10 @@ class SafePandaKinematicEnv(PandaTask, gym.Env):
         return self._observe(world), reward, terminated, False, info
 
     def _observe(self, world: World) -> dict[str, Array]:
-        return {key: rows[0] for key, rows in self._worlds.observe(world).items()}
+        return {key: rows[0] for key, rows in _worlds().observe(world).items()}
 
     def _info(self, world: World, before: Array, reached: bool) -> dict[str, Any]:
-        rows = self._worlds.report(world, before, np.array([reached]))
+        rows = _worlds().report(world, before, np.array([reached]))
         return {
             "cost": float(rows["cost"][0]),
             "clearance": float(rows["clearance"][0]),
@@ -136,9 +142,9 @@ class SafePandaKinematicEnv(PandaTask, gym.Env):
 
 
 def check_no_pictures(render_mode: str | None) -> None:
-    """Raise ``ValueError`` unless no pictures are asked for."""
+    """Raise ``TypeError`` unless no pictures are asked for: where there is no such argument, others go on without."""
     if render_mode is not None:
-        raise ValueError(
+        raise TypeError(
             f"RISE-SafePandaKinematic-v0 draws no pictures: render_mode must be None, got {render_mode!r}; "
             "RISE-SafePanda-v0 has 'rgb_array', and the same seeds"
         )

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
-
-import numpy as np
 
 from rise_envs.actions import finite_action
 
@@ -22,6 +21,7 @@ class Backend:
         own: makes the arrays that they run on out of NumPy's.
         give: makes what is handed out of the arrays that they run on.
         action: checks an action and makes an array to run on of it: (action, shape) -> (B, 2).
+        chosen: what `choose` was asked for: a copy is chosen anew, as modules cannot be copied.
         threads: that share the work.
     """
 
@@ -29,7 +29,11 @@ class Backend:
     own: Callable[[Any], Any]
     give: Callable[[Any], Any]
     action: Callable[[Any, tuple[int, ...]], Any]
+    chosen: tuple[str, str, bool | None]
     threads: int = 1
+
+    def __reduce__(self) -> Any:
+        return choose, self.chosen
 
 
 def choose(backend: str, device: str, compiled: bool | None) -> Backend:
@@ -51,7 +55,7 @@ def choose(backend: str, device: str, compiled: bool | None) -> Backend:
     else:
         from rise_envs import vehicle_arrays as dynamics  # type: ignore[no-redef]
     if backend == "numpy":
-        return Backend(dynamics, _same, _same, finite_action)
+        return Backend(dynamics, _same, _same, finite_action, (backend, device, compiled))
     return _with_torch(dynamics, device, compiled)
 
 
@@ -91,6 +95,7 @@ def _with_torch(dynamics: Any, device: str, compiled: bool) -> Backend:
     def _is_real(values: Any) -> bool:
         return not values.is_complex() and values.dtype != torch.bool
 
+    chosen = "torch", device, compiled
     if compiled:  # tensors and arrays share their memory on the CPU
-        return Backend(dynamics, _same, torch.from_numpy, on_host, torch.get_num_threads())
-    return Backend(dynamics, lambda array: torch.as_tensor(np.asarray(array), device=place), _same, on_device)
+        return Backend(dynamics, _same, torch.from_numpy, on_host, chosen, torch.get_num_threads())
+    return Backend(dynamics, functools.partial(torch.as_tensor, device=place), _same, on_device, chosen)

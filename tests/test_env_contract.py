@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import functools
+import pickle
 import warnings
 from collections.abc import Iterator
 from typing import Any
@@ -83,6 +85,18 @@ def test_stable_baselines_check_env(env: Any) -> None:
     assert complaints(check_env_sb3, Scaled(env)) == []
 
 
+def test_stable_baselines_makes_batches(env_id: str) -> None:
+    """It asks for pictures first, and makes an environment that refuses the argument without them."""
+    from stable_baselines3.common.env_util import make_vec_env
+
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*render_mode='rgb_array' that is not in the possible")
+        envs = make_vec_env(env_id, 2, seed=3, wrapper_class=rise_envs.ObservationNoise)
+    twin = rise_envs.VectorObservationNoise(gym.make_vec(env_id, 2, vectorization_mode="sync"))
+    np.testing.assert_equal(envs.reset(), twin.reset(seed=3)[0])
+    envs.close(), twin.close()
+
+
 # --- replay -----------------------------------------------------------------------------------------------
 
 
@@ -154,3 +168,21 @@ def test_hindsight_replay_of_stable_baselines(env_id: str, reward_type: str) -> 
     expected = reached - 1.0 if reward_type == "sparse" else (before - gap) / radius + reached
     np.testing.assert_allclose(sample.rewards.numpy()[:, 0], expected, atol=1e-4)
     env.close()
+
+
+def pickled(env: Any) -> Any:
+    return pickle.loads(pickle.dumps(env))
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, pickled])
+@pytest.mark.parametrize("env_id", [each for each in rise_envs.ENVS if each != "RISE-SafePanda-v0"])
+def test_a_copy_goes_on_as_its_original(env_id: str, copied: Any) -> None:
+    """But for the arm whose state is the engine's."""
+    env = rise_envs.ObservationNoise(gym.make(env_id), "step+delay:2")
+    env.reset(seed=4)
+    doings = actions(env.action_space, 0)
+    for action in doings[:3]:
+        env.step(action)
+    twin = copied(env)
+    theirs = [twin.step(action) for action in doings] + [twin.reset()]
+    np.testing.assert_equal([env.step(action) for action in doings] + [env.reset()], theirs)

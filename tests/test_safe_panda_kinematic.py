@@ -114,6 +114,6 @@ def test_a_collision_is_named_and_ends_the_episode_if_asked_to() -> None:
 
 
 def test_there_are_no_pictures() -> None:
-    with pytest.raises(ValueError, match=r"no pictures.*RISE-SafePanda-v0"):
+    with pytest.raises(TypeError, match=r"no pictures.*RISE-SafePanda-v0"):
         SafePandaKinematicEnv(render_mode="rgb_array")
     assert SafePandaKinematicEnv().render_mode is None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import importlib
+import pickle
 from typing import Any
 
 import gymnasium as gym
@@ -110,6 +111,18 @@ def test_masked_reset_with_seeds_touches_only_its_rows(env_id: str) -> None:
         assert_same(a.reset(seed=seed, options=options), b.reset(seed=seed, options=dict(options)))
         assert options.keys() == {"reset_mask"}
         assert_same(a.reset(), b.reset())
+
+
+def test_a_copy_goes_on_as_its_original(env_id: str) -> None:
+    env = native(env_id, 3, max_episode_steps=4)
+    env.reset(seed=2)
+    action = env.action_space.sample()
+    env.step(action)
+    twins = copy.deepcopy(env), pickle.loads(pickle.dumps(env))
+    for _ in range(6):
+        out = env.step(action)
+        for twin in twins:
+            assert_same(twin.step(action), out)
 
 
 def test_unseeded_resets_differ(env_id: str) -> None:

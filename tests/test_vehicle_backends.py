@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import pickle
 from typing import Any
 
 import gymnasium as gym
@@ -110,6 +111,17 @@ def test_torch_hands_out_tensors_only_and_nothing_twice(compiled: bool) -> None:
         for array, then in zip(arrays, kept, strict=True):
             np.testing.assert_array_equal(array, then)
             array[...] = 77
+
+
+@pytest.mark.parametrize("kwargs", [{}, *OTHERS.values()], ids=str)
+def test_a_pickled_batch_goes_on_as_its_original(kwargs: dict[str, Any]) -> None:
+    env = make(3, max_episode_steps=4, **kwargs)
+    env.reset(seed=2)
+    action = np.ones((3, 2), np.float32)
+    env.step(action)
+    twin = pickle.loads(pickle.dumps(env))
+    for step in range(6):
+        assert_same(as_numpy(env.step(action)), as_numpy(twin.step(action)), str(step))
 
 
 @pytest.mark.parametrize("compiled", [True, False])
