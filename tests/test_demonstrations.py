@@ -175,6 +175,10 @@ def test_minari_round_trip(vehicle_demonstrations, tmp_path, monkeypatch):
         minari_io.load("nothing/here-v0", VEHICLE)
     with pytest.raises(DatasetError, match="observation"):
         minari_io.load("rise/vehicle-v0", "RISE-SafePanda-v0")
+    for wrong in ("rise/vehicle-v0", "vehicle", "r/vehicle-v0"):
+        with pytest.raises(ValueError, match=wrong):
+            minari_io.export(part, wrong)
+    assert list(tmp_path.iterdir()) == [tmp_path / "rise"]
 
 
 @pytest.fixture

@@ -43,6 +43,7 @@ def export(d: Demonstrations, dataset_id: str) -> None:
     import minari
     from minari.data_collector import EpisodeBuffer
 
+    check_id(dataset_id)
     env = env_class(d.env_id)()
     action_space = spaces.Box(
         env.action_space.low.astype(np.float64), env.action_space.high.astype(np.float64), dtype=np.float64
