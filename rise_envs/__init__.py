@@ -91,9 +91,12 @@ def register_env(
 
 
 def _tell_gymnasium(env_id: str) -> None:
-    if env_id not in gym.registry:
-        entry, vector, steps = ENVS[env_id]
+    entry, vector, steps = ENVS[env_id]
+    known = gym.registry.get(env_id)
+    if known is None:
         gym.register(env_id, entry_point=entry, vector_entry_point=vector, max_episode_steps=steps)
+    else:  # the same class again, as of a cell of a notebook, perhaps with other numbers
+        known.vector_entry_point, known.max_episode_steps = vector, steps
 
 
 for _id in ENVS:

@@ -245,6 +245,16 @@ def test_the_same_entry_again_is_welcome():
     register_filter("smooth", "smoothing:Smooth")
 
 
+def test_who_registers_an_environment_again_can_change_its_steps():
+    example("omni_base")
+    base, before = sys.modules["omni_base"].OmniBase, rise_envs.ENVS["OmniBase-v0"]
+    try:
+        register_env("OmniBase-v0", base, 7)
+        assert rise_envs.ENVS["OmniBase-v0"][2] == gym.spec("OmniBase-v0").max_episode_steps == 7
+    finally:
+        register_env("OmniBase-v0", base, before[2])
+
+
 def test_a_class_that_breaks_the_contract_is_told(vehicle_demonstrations):
     """An environment that says nothing of velocities; an agent whose rows depend on their neighbours."""
     example("omni_base", "neighbours")
