@@ -213,6 +213,27 @@ def test_a_set_has_episodes():
             generate(VEHICLE, "cbf", episodes=number)
 
 
+def test_a_minari_set_of_noisy_readings_is_refused(vehicle_demonstrations, tmp_path, monkeypatch):
+    """A collector around a noise wrapper records what was read, and the truth beside it."""
+    import minari
+    from minari.data_collector import EpisodeBuffer
+
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    d = vehicle_demonstrations.first(1)
+    clean = {key: np.concatenate((d.observations[key], d.final[key])) for key in d.observations}
+    n, noisy = len(d.actions), {**clean, "obstacle": clean["obstacle"] + 0.1}
+    episode = EpisodeBuffer(
+        **{"observations": noisy, "actions": d.actions, "rewards": list(d.rewards)},
+        **{"terminations": [False] * (n - 1) + [True], "truncations": [False] * n},
+        infos={"cost": np.zeros(n + 1), "clean_observation": clean},
+    )
+    about = dict.fromkeys(("algorithm_name", "author", "author_email", "code_permalink", "description"), "me")
+    about |= dict.fromkeys(("env", "eval_env"), VEHICLE)
+    minari.create_dataset_from_buffers("lab/noisy-v0", [episode], **about)
+    with pytest.raises(DatasetError, match=r"'lab/noisy-v0': .* noise wrapper"):
+        minari_io.load("lab/noisy-v0", VEHICLE)
+
+
 def test_a_changed_number_in_a_minari_set_is_noticed(exported):
     h5py = pytest.importorskip("h5py")
     with h5py.File(exported / "main_data.hdf5", "r+") as file:

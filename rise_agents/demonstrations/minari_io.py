@@ -142,6 +142,8 @@ def _arrays(episodes: list[Any]) -> dict[str, Any]:
         known = "cost" in (episode.infos or {})
         return episode.infos["cost"][1:] if known else np.full(len(episode.actions), np.nan)
 
+    if any("clean_observation" in (e.infos or {}) for e in episodes):
+        raise DatasetError("its readings are noisy: record inside of the noise wrapper, not around it")
     lengths = [len(e.actions) for e in episodes]
     arrays: dict[str, Any] = {
         "actions": np.concatenate([e.actions for e in episodes]).astype(np.float64),
