@@ -35,7 +35,8 @@ HOLD = 1.0  # s that the end of an episode is shown
 _EXAMPLES = """\
 examples:
   python -m rise_agents.play RISE-GroundVehicle-v0
-  python -m rise_agents.play RISE-SafePanda-v0 --noise-model episode --noise-level 0.5
+  python -m rise_agents.play RISE-SafePanda-v0 --rate 8 --noise-model episode --noise-level 0.5
+                                       the arm at a third of its speed: its episodes last 2 seconds
   python -m rise_agents.play RISE-GroundVehicle-v0 --out demos/mine
 
 Arrow keys drive (up: ahead, left and right: turn; the arm: arrow keys across the table, W and S up and down),
