@@ -18,8 +18,9 @@ import numpy as np
 from benchmarks.faults import hostile
 from benchmarks.faults.checkpoints import wrong_values
 from benchmarks.faults.measure import Effort, Fault, Findings, Tell
-from benchmarks.faults.programs import PROGRAMS, VEHICLE, Program, name_of, words
+from benchmarks.faults.programs import PROGRAMS, Program, name_of, words
 from benchmarks.faults.training import BENCHMARKED
+from benchmarks.presets import VEHICLE
 from rise_agents import AGENTS, agent_class, make_agent
 
 LIMIT = 1.0  # s

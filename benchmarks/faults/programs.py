@@ -9,7 +9,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-VEHICLE = "RISE-GroundVehicle-v0"
+from benchmarks.presets import VEHICLE
+
 NAMES = ("", " ", "x", "RISE", "expertt", "é" * 40, "名前", "\U0001f916", "a\nb", "\x00", "x" * 100_000, "-", "=",
          "rise;ls", "$(ls)", "../..", "%s%n", "{0}", "[bold]x[/]", "None", "\udcff", "rise pcbc", "rise\r")  # fmt: skip
 NO_WHOLE = ("NaN", "inf", "-inf", "1e400", "1.5", "-1", "-9999999999", "", " ", "abc", "0x10", "1,000", "9" * 5_000,

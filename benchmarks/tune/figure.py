@@ -55,12 +55,8 @@ def figure(
         axis.set_xlim(left - 0.2, 100.3)
         every = [rates for (_, of), trials in marks.items() if of == env for rates, _ in trials.values()]
         if lost := sum(100 * rates.clean < left for rates in every):
-            where = {
-                "transform": axis.transAxes,
-                "ha": "right",
-                "va": "bottom",
-            }  # beside the title: no mark is there
-            axis.text(1.0, 1.02, f"← {lost} further left", size=10, color=FAINT, **where)
+            note, place = f"← {lost} further left", axis.transAxes  # above the panel, where no mark is
+            axis.text(1.0, 1.02, note, transform=place, ha="right", va="bottom", size=10, color=FAINT)
         _limit(axis, 100 * (best[env].clean - clean_loss))
         style(axis, env_label(env))
         axis.set(xlabel="on true readings", ylabel="at noise level 1")
