@@ -83,7 +83,8 @@ _PAPER = (
         (1.0,),
         3,
     ),
-    _control("Is it the encoder?", "rise", "rise-mean", "rise-beta0", "pcbc", "pcbc-noisy"),
+    _control("Is it the encoder?", "rise", "rise-mean", "rise-beta0", "pcbc", "pcbc-as-rise", "pcbc-noisy"),
+    _control("Draws of z at inference", "rise", "rise-one-draw", "rise-mean", envs=(PANDA,)),
     _control("Is C-PPO trained to its end?", "cppo", "cppo-long"),
     _control("10,000 transitions", "rise-10k", "pcbc-10k", "rise-belief-10k"),
     _control(

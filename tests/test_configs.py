@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import fields
 
 import pytest
 
@@ -11,6 +12,7 @@ from benchmarks.configs import SHIPPED, Variant, laid_over, read
 from benchmarks.protocol import make_plan
 from rise_agents import agent_class
 from rise_agents.agent import make_config
+from rise_agents.cloning import CloningConfig
 from rise_agents.experts import expert_names
 from rise_envs import ENVS
 
@@ -128,6 +130,19 @@ def test_every_shipped_variant_is_sound():
     # At the same budget of samples as RISE, which is the point of this control.
     samples = make_config(agent_class("rise"), VEHICLE, {}).n_samples
     assert found.layers[0]["pcbc-noisy"] == {"train_noise": 1.0, "n_samples": samples}
+
+
+def test_pcbc_as_rise_is_rise_without_its_encoder():
+    """Whatever the search chose for RISE: all that both have is the same."""
+    run = plan(("rise", "pcbc-as-rise"), preset="paper")
+    for env in run.envs:
+        rise, pcbc = (
+            make_config(agent_class(agent), env, run.config(row, env))
+            for row, agent in (("rise", "rise"), ("pcbc-as-rise", "pcbc"))
+        )
+        for each in fields(CloningConfig):
+            assert getattr(pcbc, each.name) == getattr(rise, each.name), (env, each.name)
+        assert pcbc.train_noise == 0
 
 
 @pytest.mark.parametrize(
