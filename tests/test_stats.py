@@ -4,7 +4,7 @@ from statistics import NormalDist
 import numpy as np
 import pyarrow as pa
 import pytest
-from scipy.stats import binomtest, bootstrap, trim_mean
+from scipy.stats import binomtest, bootstrap, t, trim_mean
 
 from benchmarks import stats
 
@@ -177,16 +177,52 @@ def test_intervals_cover_the_truth_in_simulated_studies(seed_effect):
     assert np.mean((low <= truth) & (truth <= high)) < 0.85
 
 
-@pytest.mark.parametrize(("seeds", "share"), [(2, 0.63), (5, 0.83)])
-def test_intervals_of_a_few_seeds_that_are_most_of_the_variation_are_as_short_as_the_page_says(seeds, share):
+def studies_of_training(seeds, count=1_000, n=60):
+    """Tables of which training is most of the variation; their true mean is 0."""
     rng = np.random.default_rng(seeds)
-    studies = (
-        rng.normal(size=(1_000, seeds, 1))
-        + rng.normal(size=(1_000, 1, 60))
-        + rng.normal(size=(1_000, seeds, 60))
+    return list(
+        rng.normal(size=(count, seeds, 1))
+        + rng.normal(size=(count, 1, n))
+        + rng.normal(size=(count, seeds, n))
     )
-    low, high = stats.bootstrap_intervals(list(studies))
-    assert np.mean((low <= 0) & (high >= 0)) == pytest.approx(share, abs=0.04)
+
+
+@pytest.mark.parametrize(("seeds", "alone", "share"), [(2, 0.63, 0.89), (3, 0.78, 0.92), (5, 0.83, 0.94)])
+def test_intervals_of_a_few_seeds_cover_the_truth_where_percentiles_alone_do_not(seeds, alone, share):
+    """As often as the page says."""
+    studies = studies_of_training(seeds)
+    low, high = stats.bootstrap_intervals(studies)
+    assert np.mean((low <= 0) & (high >= 0)) == pytest.approx(share, abs=0.025)
+    low, high = np.percentile(stats.bootstrap_means(studies, 2_000), [2.5, 97.5], axis=1)
+    assert np.mean((low <= 0) & (high >= 0)) == pytest.approx(alone, abs=0.04)
+
+
+def test_the_standard_error_of_a_sum_of_effects_by_hand():
+    """Nothing but what a seed and a scenario add: Satterthwaite's formula for two independent means."""
+    seeds, scenarios = np.array([1.0, 2.0, 6.0]), np.array([0.0, 4.0, 8.0, 12.0])
+    table = seeds[:, None] + scenarios
+    error, freedom = stats.standard_error(table)
+    a, b = 7 / 3, (80 / 3) / 4  # variance of each mean
+    assert error == pytest.approx(np.sqrt(a + b))
+    assert freedom == pytest.approx((a + b) ** 2 / (a**2 / 2 + b**2 / 3))
+    holed = np.insert(table, 2, 99.0, axis=1)
+    holed[1, 2] = np.nan
+    assert stats.standard_error(holed) == (error, freedom)
+    assert stats.standard_error(np.ones((3, 4))) == stats.standard_error(table[:1]) == (0.0, np.inf)
+
+
+def test_the_standard_error_is_how_much_means_vary():
+    studies = studies_of_training(5, 4_000)
+    squares = np.mean([stats.standard_error(study)[0] ** 2 for study in studies])
+    assert squares == pytest.approx(1 / 5 + 1 / 60 + 1 / 300, rel=0.04)
+
+
+def test_it_is_students_interval_where_scenarios_do_not_differ():
+    rates = np.array([0.2, 0.3, 0.5, 0.6])
+    low, high = stats.bootstrap_intervals([np.repeat(rates[:, None], 500, axis=1)])
+    half = t.ppf(0.975, 3) * rates.std(ddof=1) / 2
+    assert high[0] - low[0] == pytest.approx(2 * half)
+    assert (low[0], high[0]) == pytest.approx((0.4 - half, 0.4 + half), abs=0.02)
 
 
 def test_differences_cover_the_truth_in_simulated_studies():
@@ -199,11 +235,19 @@ def test_differences_cover_the_truth_in_simulated_studies():
 def test_rate_intervals_are_wilson_s_where_a_bootstrap_says_nothing():
     one = np.array([[1.0, 0.0, 1.0, 1.0, np.nan]])
     every, none = np.ones((3, 5)), np.zeros((3, 5))
-    mixed = np.array([[1.0, 0, 1, 1, 0]] * 3)
-    low, high = stats.rate_intervals([one, every, none, mixed])
+    mixed = np.tile([[1.0, 0, 1, 1, 0]], (3, 8))
+    low, high = stats.rate_intervals([one, every, none])
     for k, (successes, trials) in enumerate([(3, 4), (5, 5), (0, 5)]):
         assert (low[k], high[k]) == stats.wilson(successes, trials)
-    assert (low[3:], high[3:]) == stats.bootstrap_intervals([mixed])
+    assert stats.rate_intervals([mixed]) == stats.bootstrap_intervals([mixed])
+
+
+def test_intervals_end_where_rates_and_differences_do():
+    apart = np.array([[1.0] * 9 + [0.0], [0.0] * 9 + [1.0]])  # two seeds that say nothing together
+    low, high = stats.bootstrap_intervals([apart])
+    assert low[0] < -1 and high[0] > 2
+    assert stats.rate_intervals([apart]) == (0, 1)
+    assert stats.difference_intervals([2 * apart - 1]) == (-1, 1)
 
 
 def test_difference_intervals_of_differences_that_are_all_equal():
