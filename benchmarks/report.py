@@ -248,8 +248,9 @@ def _difference(
     if diff is None or low is None or high is None or p is None:
         raise ValueError("a row that is compared with another needs all numbers of the comparison")
     amount = f"{points(abs(diff))} points {'fewer' if diff > 0 else 'more'}" if diff else "as many"
-    verdict = ", no difference that these episodes can show" if low <= 0 <= high else ""
-    return amount, f"{points_interval(0 - high, 0 - low)}{verdict} ({p_value(p)})"
+    # No p where the interval holds 0: it speaks of these trained policies alone, and would seem to say the contrary.
+    verdict = ", no difference that these episodes can show" if low <= 0 <= high else f" ({p_value(p)})"
+    return amount, f"{points_interval(0 - high, 0 - low)}{verdict}"
 
 
 def _clause(row: SummaryRow) -> tuple[str, str, str, str]:

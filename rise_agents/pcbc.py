@@ -1,6 +1,7 @@
 """PC-BC: behaviour cloning conditioned on the reading itself (Ding et al., 2020; the paper's first baseline).
 
-The same inputs, data, network, loss and budget as RISE, without the encoder: a = π(s, g, c).
+By default the same inputs, data, network, loss and updates of the policy as RISE, without the encoder: a = π(s, g, c).
+The settings that a search finds for both can differ; row ``pcbc-as-rise`` of the benchmark has those of RISE.
 
 As a control it can learn on readings with noise of its own, as many noisy copies of each as RISE draws samples of
 its latent: what is left between both is then what the encoder adds to training on noise.

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import csv
 import doctest
 import importlib
 import inspect
 import re
 import runpy
 import shlex
+from collections import defaultdict
 from dataclasses import fields
 from functools import reduce
 from pathlib import Path
@@ -16,7 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.configs import SHIPPED, read
+from benchmarks.configs import FOLDER, SHIPPED, read
 from benchmarks.presets import PRESETS
 from benchmarks.replay import parser as replay_parser
 from benchmarks.results import SCHEMA
@@ -24,6 +26,7 @@ from benchmarks.run import parser, plan_of
 from benchmarks.speed.page import BLOCK
 from benchmarks.speed.rows import ROWS
 from benchmarks.tables import ComparisonRow, SummaryRow
+from benchmarks.tune import ranking
 from benchmarks.tune.__main__ import parser as tune_parser
 from rise_agents import AGENTS, agent_class, readings
 from rise_agents.belief.agent import Config as BeliefConfig
@@ -419,6 +422,35 @@ def test_the_config_file_of_the_page_is_one(tmp_path):
     path.write_text(text)
     found = read([path])
     assert list(found.variants) == list(found.searches) == ["rise-large"] and "rise" in found.layers[0]
+
+
+def test_the_table_of_limits_is_what_the_trials_say(monkeypatch):
+    with (FOLDER / "trials.csv").open() as file:
+        trials = list(csv.DictReader(file))
+    kinds = ("clean_safety", "clean_reach", "safety", "reach")
+    seeds = defaultdict(list)
+    for row in trials:
+        key = row["env"], row["agent"], int(row["trial"])
+        seeds[key].append(ranking.Rates(*(float(row[kind]) for kind in kinds)))
+    agents = ("rise", "pcbc", "cppo")
+    cells = table("benchmark.md", "may lose, points", "Vehicle: rise", "pcbc", "cppo", "Panda: rise")
+    assert len(cells) == 5
+    for limit, *scores in cells:
+        monkeypatch.setattr(ranking, "SURE", 0.0 if "not only shown" in limit else 1.645)
+        found = []
+        for env in ("RISE-GroundVehicle-v0", "RISE-SafePanda-v0"):
+            last = {
+                (agent, trial): ranking.mean(rates)
+                for (where, agent, trial), rates in seeds.items()
+                if where == env and len(rates) == 3
+            }
+            best = ranking.best_clean(last.values())
+            for agent in agents:
+                own = {trial: rates for (name, trial), rates in last.items() if name == agent}
+                episodes = 3 * 1_000
+                (first, *_) = ranking.ranked(own, float(limit.split(",")[0]) / 100, best, episodes)
+                found.append(f"{100 * own[first].score:.1f}")
+        assert scores == found, limit
 
 
 def test_the_table_of_seeds_agrees_with_the_splits():
