@@ -148,7 +148,8 @@ def parser() -> Parser:
     p.add_argument(
         "--check",
         action="store_true",
-        help="write nothing: say whether tables and page in RUN_DIR, a published folder, follow from its episodes",
+        help="write nothing: say whether tables and blocks of the page in RUN_DIR, a published folder, follow from "
+        "its episodes; figures, and words that people wrote, are not compared",
     )
     return p
 
@@ -175,7 +176,7 @@ def _check(folder: Path) -> int:
     for what in found:
         print(f"benchmarks.publish: {folder}: {what} is not what the episodes say", file=sys.stderr)
     if not found:
-        print(f"{folder}: tables and page are what the episodes say")
+        print(f"{folder}: tables, and blocks of the page, are what the episodes say")
     return 1 if found else 0
 
 

@@ -17,7 +17,8 @@ import pytest
 from hand_made import make_rows
 
 from benchmarks import publish, report, results, results_page
-from benchmarks.tables import ComparisonRow, read_table, summarise
+from benchmarks.labels import interval, percent
+from benchmarks.tables import ComparisonRow, SummaryRow, read_table, summarise
 from rise_agents import make_agent
 from rise_agents.agent import config_to_dict
 from rise_agents.files import sole_user
@@ -101,6 +102,30 @@ def contents(folder):
 @pytest.mark.skipif(not (PUBLISHED / "episodes.parquet").exists(), reason="no results are committed yet")
 def test_the_committed_results_are_what_their_episodes_say():
     assert results_page.stale(PUBLISHED) == []
+
+
+@pytest.mark.skipif(not (PUBLISHED / "episodes.parquet").exists(), reason="no results are committed yet")
+def test_the_readme_s_table_is_of_the_committed_results():
+    rows = {
+        (row.env, row.agent): row
+        for row in read_table(PUBLISHED / "summary.csv", SummaryRow)
+        if (row.noise_model, row.noise_level) == ("step", 1.0)
+    }
+    agents = ("rise", "pcbc", "cppo", "rise-belief", "rise-belief-shield", "expert-cbf")
+    readme = (PUBLISHED.parents[1] / "README.md").read_text()
+    found = re.search(r"^\| Noise level 1 \|.*\n\|[-:| ]+\n((?:\|.*\n)+)", readme, re.MULTILINE)
+    assert found is not None
+    lines = [[cell.strip() for cell in line.split("|")[2:-1]] for line in found[1].splitlines()]
+    expected = [
+        [
+            f"{percent(getattr(row, f'{rate}_rate'))} "
+            f"[{interval(getattr(row, f'{rate}_low'), getattr(row, f'{rate}_high'))}]"
+            for row in (rows[env, agent] for env in ENVS)
+            for rate in ("safety", "reach")
+        ]
+        for agent in agents
+    ]
+    assert lines == expected
 
 
 # --- what is written -------------------------------------------------------------------------------------------
