@@ -66,21 +66,24 @@ def flag(name: str, value: Any) -> bool:
     return bool(value)
 
 
-def check_fields(kind: type, values: Mapping[str, Any]) -> None:
+def check_fields(kind: type, values: Mapping[str, Any]) -> dict[str, Any]:
     """Check settings against the annotations of their class: whole and finite numbers, texts, tuples of them.
 
     Args:
         kind: a dataclass or named tuple.
         values: by the names of its fields, all or some.
 
+    Returns:
+        The same settings, numbers as they are declared: 1 is 1.0 where a float is meant.
+
     Raises:
         ValueError: a field that does not exist (the nearest one is named), or a value of another kind.
     """
     known, where = _annotations(kind), f"{kind.__module__.rpartition('.')[2]}.{kind.__name__}"
-    for name, value in values.items():
+    for name in values:
         if name not in known:
             raise ValueError(f"unknown setting {name!r} of {where}: {nearest(name, known)}")
-        _check(f"{where}.{name}", known[name], value)
+    return {name: _checked(f"{where}.{name}", known[name], value) for name, value in values.items()}
 
 
 @functools.cache
@@ -88,24 +91,27 @@ def _annotations(kind: type) -> dict[str, Any]:
     return get_type_hints(kind)
 
 
-def _check(name: str, kind: Any, value: Any) -> None:
+def _checked(name: str, kind: Any, value: Any) -> Any:
     if get_origin(kind) is tuple:
-        _check_tuple(name, get_args(kind), value)
-    elif kind in _CHECKS:
-        _CHECKS[kind](name, value)
-    elif isinstance(kind, type) and not isinstance(value, kind):
+        return _checked_tuple(name, get_args(kind), value)
+    if kind in _CHECKS:
+        return _CHECKS[kind](name, value)
+    if isinstance(kind, type) and not isinstance(value, kind):
         raise ValueError(f"{name} must be a {kind.__name__}, got {value!r}")
+    return value
 
 
-def _check_tuple(name: str, kinds: tuple[Any, ...], value: Any) -> None:
+def _checked_tuple(name: str, kinds: tuple[Any, ...], value: Any) -> tuple[Any, ...]:
     if not isinstance(value, tuple):
         raise ValueError(f"{name} must be a tuple, got {value!r}")
     if kinds[-1] is Ellipsis:
         kinds = (kinds[0],) * len(value)
     if len(value) != len(kinds):
         raise ValueError(f"{name} must have {len(kinds)} entries, got {value!r}")
-    for i, (kind, entry) in enumerate(zip(kinds, value, strict=True)):
-        _check(f"{name}[{i}]", kind, entry)
+    return tuple(
+        _checked(f"{name}[{i}]", kind, entry)
+        for i, (kind, entry) in enumerate(zip(kinds, value, strict=True))
+    )
 
 
 _CHECKS: dict[Any, Any] = {int: whole, float: finite, bool: flag}
@@ -121,9 +127,7 @@ def as_settings(kind: type[T], given: T | Mapping[str, Any], name: str = "params
         return given
     if not isinstance(given, Mapping):
         raise ValueError(f"{name} must be a {kind.__name__} or a dict of its fields, got {given!r}")
-    values = plain(given)
-    check_fields(kind, values)
-    return kind(**values)
+    return kind(**check_fields(kind, plain(given)))
 
 
 def plain(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from benchmarks.jobs import (
     Job,
     check_settings,
     checkpoint_path,
+    complete_settings,
     demonstrations_folder,
     evaluate,
     evaluation_jobs,
@@ -51,6 +52,19 @@ def test_rows_that_differ_only_in_acting_share_one_training(tmp_path):
     again = plan("rise", settings={"rise": {"average": 3}})
     (other,), (first, *_) = evaluation_jobs(again, tmp_path), jobs
     assert other.needs == first.needs and other.output != first.output
+
+
+def test_a_number_is_the_same_however_it_is_written(tmp_path):
+    """TOML and ``--set`` tell 1 from 1.0; a field of floats does not, and one of whole numbers stays as it is."""
+    one, same = ({"beta": beta, "hidden": [64], "updates": 300} for beta in (1, 1.0))
+    paths = {
+        checkpoint_path(plan("rise", settings={"rise": each}), VEHICLE, "rise", 0, tmp_path)
+        for each in (one, same)
+    }
+    assert len(paths) == 1
+    settings = complete_settings(plan("rise", settings={"rise": one}), VEHICLE, "rise")
+    assert type(settings["beta"]) is float and type(settings["updates"]) is int
+    assert settings["hidden"] == [64] and type(settings["hidden"][0]) is int
 
 
 def test_equal_training_shares_a_file_and_other_training_does_not(tmp_path):
