@@ -24,6 +24,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
@@ -127,7 +128,39 @@ def _noise_seeds(options: dict[str, Any] | None, n: int) -> tuple[list[int] | No
     return np.broadcast_to(seeds, n).tolist(), rest or None
 
 
-class ObservationNoise(gym.Wrapper, RecordConstructorArgs):
+class _Noisy(RecordConstructorArgs):
+    """What both wrappers do with their arguments."""
+
+    env: Any
+
+    def _begin(
+        self,
+        space: spaces.Space,
+        rows: tuple[int, int],
+        noise: str | NoiseModel,
+        keys: str | Sequence[str] | None,
+        noise_level: float,
+        noise_scale: Scale | None,
+        noise_channels: Given | None,
+    ) -> None:
+        """Record and use them; ``rows`` are the arguments ``n`` and ``ahead`` of :class:`NoiseRows`."""
+        RecordConstructorArgs.__init__(
+            self,
+            noise=noise,
+            keys=keys,
+            noise_level=noise_level,
+            noise_scale=noise_scale,
+            noise_channels=noise_channels,
+        )
+        self.channels = Channels.of(space, keys)
+        scale = self.channels.scale(noise_scale, _published(self.env, "noise_scale"))
+        groups = self.channels.groups(noise_channels, _published(self.env, "noise_channels"))
+        layer = _published(self.env, "noise_layers") or 0
+        self._rows = NoiseRows(make_noise(noise, noise_level, groups), scale, *rows, layer)
+        self.noise_layers = layer + 1  # this one included: a wrapper around this one asks for it
+
+
+class ObservationNoise(gym.Wrapper, _Noisy):
     """Any environment, its observation read with noise. The rules are at the top of this module.
 
     An environment whose ``unwrapped.perceived`` exists (the RISE ones) finds its noisy ``obstacle`` reading
@@ -160,22 +193,9 @@ class ObservationNoise(gym.Wrapper, RecordConstructorArgs):
         noise_scale: Scale | None = None,
         noise_channels: Given | None = None,
     ) -> None:
-        RecordConstructorArgs.__init__(
-            self,
-            noise=noise,
-            keys=keys,
-            noise_level=noise_level,
-            noise_scale=noise_scale,
-            noise_channels=noise_channels,
-        )
         gym.Wrapper.__init__(self, env)
-        self.channels = Channels.of(env.observation_space, keys)
+        self._begin(env.observation_space, (1, 64), noise, keys, noise_level, noise_scale, noise_channels)
         self.observation_space = self.channels.noisy_space(env.observation_space)
-        scale = self.channels.scale(noise_scale, _published(env, "noise_scale"))
-        groups = self.channels.groups(noise_channels, _published(env, "noise_channels"))
-        layer = _published(env, "noise_layers") or 0
-        self._rows = NoiseRows(make_noise(noise, noise_level, groups), scale, 1, ahead=64, layer=layer)
-        self.noise_layers = layer + 1  # this one included: a wrapper around this one asks for it
         named = dict(zip(self.channels.keys or (), self.channels.spans, strict=False))
         self._base: Any = env.unwrapped
         self._obstacle = named.get("obstacle") if hasattr(self._base, "perceived") else None
@@ -217,7 +237,7 @@ class ObservationNoise(gym.Wrapper, RecordConstructorArgs):
         return self.channels.write(clean, noisy), info
 
 
-class VectorObservationNoise(VectorWrapper, RecordConstructorArgs):
+class VectorObservationNoise(VectorWrapper, _Noisy):
     """Any vector environment, its observations read with noise: the twin of :class:`ObservationNoise`.
 
     It hands out what a ``SyncVectorEnv`` of environments wrapped one by one would, number for number, in all
@@ -247,28 +267,15 @@ class VectorObservationNoise(VectorWrapper, RecordConstructorArgs):
         noise_scale: Scale | None = None,
         noise_channels: Given | None = None,
     ) -> None:
-        RecordConstructorArgs.__init__(
-            self,
-            noise=noise,
-            keys=keys,
-            noise_level=noise_level,
-            noise_scale=noise_scale,
-            noise_channels=noise_channels,
-        )
         VectorWrapper.__init__(self, env)
         try:
             self._mode = AutoresetMode(env.metadata["autoreset_mode"])
         except (KeyError, ValueError):
             raise ValueError(f"{env}: metadata['autoreset_mode'] must be a gymnasium AutoresetMode") from None
-        self.channels = Channels.of(env.single_observation_space, keys)
-        self.single_observation_space = self.channels.noisy_space(env.single_observation_space)
+        space, rows = env.single_observation_space, (env.num_envs, 1)
+        self._begin(space, rows, noise, keys, noise_level, noise_scale, noise_channels)
+        self.single_observation_space = self.channels.noisy_space(space)
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
-        scale = self.channels.scale(noise_scale, _published(env, "noise_scale"))
-        groups = self.channels.groups(noise_channels, _published(env, "noise_channels"))
-        layer = _published(env, "noise_layers") or 0
-        model = make_noise(noise, noise_level, groups)
-        self._rows = NoiseRows(model, scale, env.num_envs, ahead=1, layer=layer)
-        self.noise_layers = layer + 1
         self._noisy: Array | None = None  # as last handed out
         self._done = np.zeros(env.num_envs, dtype=bool)
 
