@@ -35,6 +35,7 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Callable
+from dataclasses import astuple
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -167,6 +168,29 @@ def _make_part(part: Part, whole: str) -> NoiseModel:
     except TypeError:
         raise ValueError(f"noise model {text!r}: too many parameters") from None
     return Only(model, group) if group else model
+
+
+def text_of(model: NoiseModel) -> str | None:
+    """The text of which :func:`make_noise` makes an equal model; None: there is none.
+
+    >>> text_of(make_noise("episode@radius + delay:2"))
+    'episode:1.0@radius+delay:2'
+    """
+    try:
+        text = _written(model)
+        return text if make_noise(text) == model else None
+    except (LookupError, TypeError, ValueError):  # a class without a name, or with what is no number
+        return None
+
+
+def _written(model: NoiseModel) -> str:
+    if isinstance(model, Compose):
+        return "+".join(map(_written, model.parts))
+    if isinstance(model, Only):
+        return f"{_written(model.model)}@{model.group}"
+    names: dict[Any, str] = {kind: name for name, kind in NOISE_MODELS.items()}
+    values: Any = model  # a dataclass, or a TypeError
+    return ":".join(map(str, (names[type(model)], *astuple(values))))
 
 
 def corrupt(

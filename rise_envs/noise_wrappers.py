@@ -31,7 +31,7 @@ from gymnasium.vector.utils import batch_space
 
 from rise_envs import streams
 from rise_envs.episodes import check_options, check_reset, each_seed, reset_mask
-from rise_envs.noise import make_noise
+from rise_envs.noise import make_noise, text_of
 from rise_envs.noise_channels import Channels, Given, Scale, own_copy, placed
 from rise_envs.noise_models import Array, Keys, NoiseModel, State, Steps
 
@@ -144,9 +144,10 @@ class _Noisy(RecordConstructorArgs):
         noise_channels: Given | None,
     ) -> None:
         """Record and use them; ``rows`` are the arguments ``n`` and ``ahead`` of :class:`NoiseRows`."""
+        text = text_of(noise) if isinstance(noise, NoiseModel) else None  # which JSON knows
         RecordConstructorArgs.__init__(
             self,
-            noise=noise,
+            noise=text or noise,
             keys=keys,
             noise_level=noise_level,
             noise_scale=noise_scale,

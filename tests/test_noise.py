@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
 
 from rise_envs import streams
-from rise_envs.noise import NOISE_MODELS, corrupt, make_noise, parts_of
+from rise_envs.noise import NOISE_MODELS, corrupt, make_noise, parts_of, text_of
 from rise_envs.noise_models import (
     Compose,
     Delay,
@@ -410,3 +410,26 @@ def test_a_new_model_needs_one_class_and_one_line(monkeypatch):
     monkeypatch.setitem(NOISE_MODELS, "flip", Flip)
     readings = some_readings(2, 3)
     assert_array_equal(corrupt("flip+flip", readings, 1.0, keys_of(2)), readings)
+
+
+@pytest.mark.parametrize(
+    "model",
+    [*(kind() for kind in NOISE_MODELS.values()), Outlier(0.1, 1e22) + Only(Delay(2), "a"), StepNoise(1e-7)],
+)
+def test_the_text_of_a_model_makes_it_again(model):
+    text = text_of(model)
+    assert text is not None and make_noise(text) == model
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        Compose(()),
+        Only(StepNoise(), "a", (1,)),
+        Only(StepNoise() + Delay(), "a"),
+        Compose((StepNoise() + Delay(), Dropout())),
+        type("Other", (StepNoise,), {})(),
+    ],
+)
+def test_a_model_that_no_text_makes_has_none(model):
+    assert text_of(model) is None

@@ -14,8 +14,8 @@ from numpy.testing import assert_array_equal, assert_equal
 
 import rise_envs
 from rise_envs import streams
-from rise_envs.noise import corrupt
-from rise_envs.noise_models import EpisodeBias, StepNoise
+from rise_envs.noise import corrupt, make_noise
+from rise_envs.noise_models import Delay, EpisodeBias, StepNoise
 from rise_envs.noise_wrappers import ObservationNoise, VectorObservationNoise
 from rise_envs.task import task_of
 
@@ -339,8 +339,9 @@ def test_step_before_reset():
         ObservationNoise(Careless()).step(np.zeros(2))
 
 
-def test_a_spec_rebuilds_the_wrapper():
-    env = ObservationNoise(vehicle(), "episode", noise_level=0.5)
+@pytest.mark.parametrize("noise", ["episode", make_noise("drift:1e-05@position") + Delay(3)])
+def test_a_spec_rebuilds_the_wrapper(noise):
+    env = ObservationNoise(vehicle(), noise, noise_level=0.5)
     again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
     assert_equal(episode(again, seed=1)[0], episode(env, seed=1)[0])
 
