@@ -111,7 +111,7 @@ def _rates(path: Path) -> _Rates:
 
 def send(
     trainings: Sequence[Tracked], folder: Path, project: str, entity: str = "", offline: bool = False
-) -> bool:
+) -> str:
     """Write trainings to Weights & Biases, a run each, in a group per environment.
 
     Args:
@@ -122,11 +122,11 @@ def send(
         offline: whether the files stay there until ``wandb sync`` sends them; False: as its configuration says.
 
     Returns:
-        Whether they do.
+        Where they are now, in words.
     """
     import wandb
 
-    stay = offline
+    where = ""
     for each in trainings:
         run = wandb.init(
             project=project,
@@ -141,12 +141,16 @@ def send(
             resume=None if offline else "allow",
             settings=wandb.Settings(silent=True),
         )
-        stay = bool(run.offline)
+        where = f"project {project}"
+        if run.offline:
+            where = f"{folder / 'wandb'}: wandb sync sends it"
+        elif run.disabled:
+            where = "no project: WANDB_MODE or the configuration of wandb says disabled"
         for step, figures in each.curve:
             run.log(figures, step=step)
         run.summary.update(each.summary)
         run.finish()
-    return stay
+    return where
 
 
 def parser() -> Parser:
@@ -175,11 +179,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     if importlib.util.find_spec("wandb") is None:
         raise ValueError("this needs one more package: pip install 'rise-suite[wandb]'")
     try:
-        stay = send(trainings, a.run, a.project, a.entity, a.offline)
+        where = send(trainings, a.run, a.project, a.entity, a.offline)
     except Exception as error:  # of a library that has many kinds, most of a network
         why = " ".join(str(error).split())
         raise WorkFailed(why if a.offline else f"{why}; with --offline it goes into files first") from error
-    where = f"{a.run / 'wandb'}: wandb sync sends it" if stay else f"project {a.project}"
     print(f"{count([len(trainings)], 'training')} in {where}")
     return 0
 

@@ -62,7 +62,8 @@ class Library:
         run = SimpleNamespace(how=how, logged=[], summary={}, ended=False)
         run.log = lambda figures, step: run.logged.append((step, figures))
         run.finish = lambda: setattr(run, "ended", True)
-        run.offline = (how["mode"] or self.configured) == "offline"
+        mode = how["mode"] or self.configured
+        run.offline, run.disabled = mode == "offline", mode == "disabled"
         self.runs.append(run)
         return run
 
@@ -110,6 +111,12 @@ def test_its_own_word_for_offline_holds(run, library, capsys):
     library.configured = "offline"
     assert upload.main([str(run), "--project", "mine"]) == 0
     assert "wandb sync sends it" in capsys.readouterr().out
+
+
+def test_what_is_disabled_is_in_no_project(run, library, capsys):
+    library.configured = "disabled"
+    assert upload.main([str(run), "--project", "mine"]) == 0
+    assert capsys.readouterr().out.startswith("2 trainings in no project: WANDB_MODE")
 
 
 def test_what_cannot_be_uploaded_is_one_line(run, tmp_path, library, monkeypatch, capsys):
