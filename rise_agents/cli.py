@@ -85,7 +85,8 @@ def one_line(error: Exception) -> str:
     return "\\n".join(str(error).splitlines())
 
 
-INTERRUPTED = "interrupted; what is finished is kept, run the command again to go on"
+KEPT = "what is finished is kept, run the command again to go on"
+INTERRUPTED = f"interrupted; {KEPT}"
 
 Main = Callable[[Sequence[str] | None], int]
 Errors = tuple[type[Exception], ...]

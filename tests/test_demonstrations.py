@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import time
 
 import gymnasium as gym
 import numpy as np
@@ -12,6 +15,7 @@ from rise_agents import archive
 from rise_agents.demonstrations import CARD, DATA, DatasetError, generate, load, minari_io
 from rise_agents.demonstrations.__main__ import main
 from rise_agents.demonstrations.dataset import check
+from rise_agents.demonstrations.recording import part_path, record_part
 
 VEHICLE = "RISE-GroundVehicle-v0"
 
@@ -294,6 +298,38 @@ def test_an_interrupted_recording_goes_on(tmp_path):
     assert {path: path.stat().st_mtime_ns for path in before} == before
     for name, array in whole.arrays().items():
         np.testing.assert_array_equal(again.arrays()[name], array)
+
+
+def test_a_recording_whose_worker_is_killed_says_how_to_go_on(tmp_path, monkeypatch, capsys):
+    out = tmp_path / "set"
+    command = ["--env", VEHICLE, "--expert", "cbf", "--episodes", "60", "--workers", "2", "--out", str(out)]
+    monkeypatch.setattr("rise_agents.demonstrations.recording._record", _record_or_die)
+    assert main(command) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and said.endswith(
+        "recording from episode 50 on: its worker process ended with SIGKILL (out of memory? fewer workers need less);"
+        " what is finished is kept, run the command again to go on\n"
+    )
+    (piece,) = out.glob(".parts/*/*")
+    monkeypatch.undo()
+    monkeypatch.setattr("rise_agents.demonstrations.recording.record_part", _only_the_second)
+    assert main([*command, "--workers", "1"]) == 0
+    assert len(load(out)) == 60 and not piece.exists()
+
+
+def _record_or_die(tell, output, env, expert, seed, start, count):
+    """The first piece is recorded; who has the second one waits for that, and is killed."""
+    if start == 0:
+        record_part(output, tell, env, expert, seed, start, count)
+    while start and not part_path(output.parent, 0).exists():
+        time.sleep(0.05)
+    if start:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def _only_the_second(output, tell, env, expert, seed, start, count):
+    assert start > 0
+    record_part(output, tell, env, expert, seed, start, count)
 
 
 def test_pieces_of_another_recording_are_refused(tmp_path):

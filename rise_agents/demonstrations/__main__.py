@@ -12,7 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from rise_agents import demonstrations
 from rise_agents.agent import nearest
-from rise_agents.cli import Parser, at_work, command, prepare_folder
+from rise_agents.cli import INTERRUPTED, KEPT, Parser, WorkFailed, at_work, command, prepare_folder
 from rise_agents.demonstrations.minari_io import check_id, export
 from rise_agents.demonstrations.recording import chunk_size
 from rise_agents.experts import expert_names
@@ -74,6 +74,23 @@ def checked(argv: Sequence[str] | None) -> argparse.Namespace:
     return a
 
 
+def record(a: argparse.Namespace, bars: Progress) -> demonstrations.Demonstrations:
+    """Record what the folder lacks; raises :class:`WorkFailed` if a worker process died or gave up."""
+    bar = bars.add_task(f"{a.expert} on {a.env}", total=a.episodes)
+    try:
+        return demonstrations.generate(
+            a.env,
+            a.expert,
+            a.episodes,
+            a.seed,
+            a.workers or available_cores(),
+            finished=lambda kept, tried: bars.update(bar, completed=kept),
+            parts=a.out / ".parts" / f"{a.expert}-seed{a.seed}-{chunk_size(a.episodes)}",
+        )
+    except TaskError as error:
+        raise WorkFailed(f"{error}; {KEPT}") from error
+
+
 def recorded(a: argparse.Namespace) -> demonstrations.Demonstrations:
     """The set that is in the folder already; raises ``ValueError`` if it is not the one that the arguments ask for."""
     made = demonstrations.load(a.out)
@@ -84,10 +101,7 @@ def recorded(a: argparse.Namespace) -> demonstrations.Demonstrations:
     return made
 
 
-@command(
-    "rise_agents.demonstrations",
-    interrupted="interrupted; what is recorded is kept, run the command again to go on",
-)
+@command("rise_agents.demonstrations", interrupted=INTERRUPTED)
 def main(argv: Sequence[str] | None = None) -> int:
     """Record demonstrations; returns the exit code: 0 done, 1 failed, 2 bad arguments, 130 interrupted."""
     console = Console(stderr=True)
@@ -97,22 +111,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         raise ValueError(str(error)) from None
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     bars = Progress(*columns, console=console, disable=not console.is_terminal)
-    pieces = a.out / ".parts" / f"{a.expert}-seed{a.seed}-{chunk_size(a.episodes)}"
-    with at_work(TaskError), sole_user(a.out), bars:
+    with at_work(), sole_user(a.out), bars:
         sweep(a.out)
         if (a.out / demonstrations.DATA).exists():  # the export is what is missing
             made = recorded(a)
         else:
-            bar = bars.add_task(f"{a.expert} on {a.env}", total=a.episodes)
-            made = demonstrations.generate(
-                a.env,
-                a.expert,
-                a.episodes,
-                a.seed,
-                a.workers or available_cores(),
-                finished=lambda kept, tried: bars.update(bar, completed=kept),
-                parts=pieces,
-            )
+            made = record(a, bars)
             made.save(a.out)
         shutil.rmtree(a.out / ".parts", ignore_errors=True)
         if a.minari is not None:

@@ -180,7 +180,8 @@ def _ordered(
                     begun += 1
                 for ended in pool.wait():
                     if ended.error or ended.died:
-                        reason = ended.error or f"its worker process ended with {ended.died}"
+                        memory = " (out of memory? fewer workers need less)" * (ended.died == "SIGKILL")
+                        reason = ended.error or f"its worker process ended with {ended.died}{memory}"
                         raise TaskError(f"recording from episode {ended.key * count} on: {reason}")
             yield _read_part(path, _facts(env_id, expert, seed, number * count, count))
 
