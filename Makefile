@@ -72,7 +72,8 @@ lint: $(STAMP)
 	$(BIN)/python -m mypy docs/conf.py docs/pictures.py
 
 docs: $(STAMP)
-	$(BIN)/python -m sphinx --fail-on-warning --keep-going --nitpicky --quiet --jobs auto docs build/docs $(ARGS)
+	$(BIN)/python -m sphinx --fail-on-warning --keep-going --nitpicky --quiet --jobs auto \
+	  --doctree-dir build/doctrees docs build/docs $(ARGS)
 	@echo "open build/docs/index.html"
 
 # pip-audit has a venv of its own, so that it changes nothing of what it looks at. --strict: a package that the

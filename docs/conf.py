@@ -176,6 +176,15 @@ def only_what_is_there(app: Sphinx, docname: str, source: list[str]) -> None:
         source[0] = "".join(line for line in lines if "results/README" not in line)
 
 
+def in_one_document(app: Sphinx, page: nodes.document) -> None:
+    """Blocks of reStructuredText in Markdown keep a document of their own, and the whole environment with it.
+
+    It would be stored with every page.
+    """
+    for node in page.findall():
+        node.document = page
+
+
 def setup(app: Sphinx) -> None:
     """Connect what is above; called by Sphinx."""
     app.connect("builder-inited", lambda app: catalogue.write(Path(app.srcdir) / catalogue.FOLDER))
@@ -184,5 +193,6 @@ def setup(app: Sphinx) -> None:
     app.connect("autodoc-process-docstring", without_markdown)
     app.connect("autodoc-process-signature", with_short_arrays)
     app.connect("autodoc-skip-member", without_repetition)
+    app.connect("doctree-read", in_one_document)
     app.connect("missing-reference", without_page)
     app.add_transform(Links)

@@ -202,6 +202,8 @@ def test_links_to_files_lead_to_pages_of_the_site(tmp_path):
     assert ["api.html", "module-rise_envs.noise"] in targets
     assert ["reference/security.html"] in targets
     assert "_downloads" not in html
+    stored = (tmp_path / "out" / ".doctrees" / "api.doctree").read_bytes()
+    assert b"BuildEnvironment" not in stored  # which is large
 
 
 def test_links_to_what_is_not_there_are_errors(tmp_path):
