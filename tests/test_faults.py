@@ -223,8 +223,8 @@ for job in range(2):
     path.write_text(f"{job} {os.getpid() if broken == 'again' else ''}")
 if broken == "stray":
     (out / ".partial-x").touch()
-for name in ("episodes.parquet", "summary.csv"):
-    (out / name).write_text(str(os.getpid()) if broken == "different" else "the same")
+for name in ("episodes.parquet", "summary.csv", "comparisons.csv"):
+    (out / name).write_text(str(os.getpid()) if broken == name else "the same")
 sys.exit(broken == "code")
 """
 
@@ -234,7 +234,8 @@ sys.exit(broken == "code")
     [
         ("", set()),
         ("again", {"finished job done again"}),
-        ("different", {"different result"}),
+        ("summary.csv", {"different result"}),
+        ("comparisons.csv", {"different result"}),
         ("stray", {"stray file"}),
         ("code", {"run failed"}),
     ],
@@ -290,16 +291,23 @@ def test_a_reference_run_that_fails_says_why(tmp_path, monkeypatch):
 
 
 def test_kill_run_counts_kills(effort, monkeypatch):
-    monkeypatch.setattr(kill_run, "reference", lambda place: kill_run.Reference(1.0, {}, frozenset()))
-    monkeypatch.setattr(
-        kill_run, "chain", lambda rng, out, made, most: (["parent", "worker"][:most], [Fault("lost", "x")])
-    )
-    findings = kill_run.run(replace(effort, share=0.03), silent)
-    assert (
-        findings.trials == 3
-        and len(findings.faults) == 2
-        and "2 of the parent, 1 of the worker" in findings.note
-    )
+    """In folders of the vehicle and of an arm, each beside an undisturbed run of its own."""
+    ways = []
+
+    def reference(place, options):
+        return kill_run.Reference(float(len(options)), {}, frozenset())
+
+    def chain(rng, out, made, most, options):
+        ways.append(options)
+        assert made.seconds == len(options)
+        return ["parent", "worker"][:most], [Fault("lost", "x")]
+
+    monkeypatch.setattr(kill_run, "reference", reference)
+    monkeypatch.setattr(kill_run, "chain", chain)
+    findings = kill_run.run(replace(effort, share=0.07), silent)
+    assert findings.trials == 7 and len(findings.faults) == 4
+    assert "4 of the parent, 3 of the worker" in findings.note
+    assert ways == list(kill_run.OPTIONS) and "--envs" in ways[-1] and not ways[0]
 
 
 @pytest.mark.slow
