@@ -17,6 +17,11 @@ from rise_agents.agent import nearest
 from rise_agents.files import replace_file
 from rise_agents.plugins import import_modules
 
+try:
+    import resource
+except ImportError:  # no POSIX system
+    resource = None  # type: ignore[assignment]
+
 
 class Parser(argparse.ArgumentParser):
     """An argument parser that raises ``ValueError`` with one line instead of printing usage and exiting.
@@ -81,8 +86,15 @@ def prepare_file(path: Path) -> None:
 
 
 def one_line(error: Exception) -> str:
-    """What an error says, its line breaks shown as a string shows them: names of files may have some."""
-    return "\\n".join(str(error).splitlines())
+    """What an error says, its line breaks shown as a string shows them: names of files may have some.
+
+    Of too many open files also how many are allowed.
+    """
+    line = "\\n".join(str(error).splitlines())
+    if resource is not None and isinstance(error, OSError) and error.errno == errno.EMFILE:
+        most = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+        line += f"; a process may have {most} here: allow more (ulimit -n 4096), or use fewer workers"
+    return line
 
 
 KEPT = "what is finished is kept, run the command again to go on"

@@ -190,6 +190,24 @@ def test_a_command_ends_in_one_line_and_a_code(error, code, says, capsys):
     assert capsys.readouterr().err == says
 
 
+def test_too_many_open_files_are_told_with_the_limit(tmp_path):
+    """As they are met, in a process that may have few."""
+    code = """
+import resource
+from rise_agents.cli import command
+@command("tool")
+def main(argv=None):
+    resource.setrlimit(resource.RLIMIT_NOFILE, (17, 17))
+    print([open(__file__) for _ in range(17)])
+raise SystemExit(main([]))
+"""
+    script = tmp_path / "tool.py"
+    script.write_text(code)
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and done.stderr.count("\n") == 1
+    assert "may have 17 here" in done.stderr and "ulimit -n" in done.stderr
+
+
 def test_what_no_user_can_cause_is_not_hidden():
     @command("tool")
     def main(argv=None):
