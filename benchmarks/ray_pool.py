@@ -150,7 +150,7 @@ def suite() -> dict[str, str]:
             digest.update(f"{package}/{path.relative_to(folder).as_posix()}\0".encode())
             digest.update(hashlib.sha256(path.read_bytes()).digest())
     own = f"{__version__} (code {digest.hexdigest()[:8]})"
-    return {"rise-suite": own, "Python": platform.python_version(), **checkpoint.versions()}
+    return {**checkpoint.versions(), "rise-suite": own, "Python": platform.python_version()}
 
 
 def differing(theirs: Mapping[str, str]) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import socket
 import sys
 import time
@@ -318,6 +319,9 @@ def test_a_node_with_other_code_or_libraries_ends_the_run(ran, tmp_path, monkeyp
 def test_the_suite_is_known_by_its_code():
     assert set(ray_pool.suite()) > {"rise-suite", "Python", "numpy", "torch"}
     assert ray_pool.differing(ray_pool.suite()) == ""
+    version, code = re.fullmatch(r"(\S+) \(code (\w{8})\)", ray_pool.suite()["rise-suite"]).groups()
+    other = {"rise-suite": f"{version} (code {'0' * 8})"}
+    assert ray_pool.differing(other) == f"rise-suite {version} (code {code}) instead of {other['rise-suite']}"
 
 
 def test_a_node_that_lacks_the_suite_ends_the_run(ran, tmp_path):
