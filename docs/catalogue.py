@@ -440,6 +440,14 @@ def module_page(name: str, private: Iterable[str] = ()) -> str:
 
 # --- other pages -----------------------------------------------------------------------------------------------
 
+_OWN, _CLUSTER = "Bring it along with `--import`: [how](../../own.md).", "[How to use it](../../cluster.md)."
+_LANGUAGES = {
+    ".py": ("python", _OWN),
+    ".sh": ("bash", _CLUSTER),
+    ".yaml": ("yaml", _CLUSTER),
+    "": ("docker", _CLUSTER),
+}  # of examples, by suffix, and what leads back
+
 
 def beside() -> dict[str, str]:
     """Pages that stand beside ``docs``, and the examples."""
@@ -448,10 +456,11 @@ def beside() -> dict[str, str]:
         for name, place in BESIDE.items()
         if place.startswith(FOLDER)
     }
-    for path in sorted((HERE / "examples").glob("*.py")):
-        code = f"```{{literalinclude}} ../../examples/{path.name}\n:language: python\n```"
-        back = "Bring it along with `--import`: [how](../../own.md)."
-        pages[f"examples/{path.stem}.md"] = page("---\norphan: true\n---", f"# {path.name}", back, code)
+    for path in sorted((HERE / "examples").iterdir()):
+        if path.is_file() and path.suffix in _LANGUAGES:
+            language, back = _LANGUAGES[path.suffix]
+            code = f"```{{literalinclude}} ../../examples/{path.name}\n:language: {language}\n```"
+            pages[f"examples/{path.stem}.md"] = page("---\norphan: true\n---", f"# {path.name}", back, code)
     return pages
 
 
