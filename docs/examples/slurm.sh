@@ -7,6 +7,7 @@
 #SBATCH --mem=0
 #SBATCH --time=12:00:00
 #SBATCH --dependency=singleton
+#SBATCH --open-mode=append
 
 set -eo pipefail
 source "$HOME/rise/.venv/bin/activate"
