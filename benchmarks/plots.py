@@ -23,7 +23,6 @@ from benchmarks.labels import (
     noise_label,
     percent,
     sample,
-    several_seeds,
     split_row,
 )
 from benchmarks.results import StrPath, atomic_write_bytes
@@ -39,6 +38,7 @@ _SPARE_COLOURS = ("#D55E00", "#56B4E9", "#7B5BA6", "#8C6D1F", "#A3423C")
 _GREYS = ("#7F7F7F", "#A6A6A6", "#595959")
 _MARKERS = "osD^vPX*<>"
 INK, FAINT, GRID = "#222222", "#6A6A6A", "#E6E6E6"
+_INTERVALS = "95 % intervals"  # which ones: benchmarks.stats
 _WIDTH = 10.0  # inches
 _LEGEND_LETTERS = 90  # that fit into its width
 _NOTE_LETTERS, _NOTE_HEIGHT = 130, 0.2  # that fit beside each other; inches from line to line
@@ -84,7 +84,7 @@ def comparison(summary: Sequence[SummaryRow], level: float, noise_model: str | N
         raise ValueError(f"no episodes at noise level {level:g}; measured were {measured or 'none'}")
     agents, envs = _names(rows, "agent"), _names(rows, "env")
     condition = condition_label(shown[0].noise_model, level)
-    notes = [condition[0].upper() + condition[1:], sample(shown, "bar"), _intervals(shown)]
+    notes = [condition[0].upper() + condition[1:], sample(shown, "bar"), _INTERVALS]
     title = "Safety and reach under noisy obstacle readings"
     figure, axes = _panels(envs, 0.85 + 0.33 * len(agents), title, notes)
     for env, pair in zip(envs, axes, strict=True):
@@ -116,7 +116,7 @@ def grouped(sections: Sequence[Section]) -> Figure:
     notes = [
         f"Noise level {' or '.join(f'{level:g}' for level in levels)}",
         sample(shown, "bar"),
-        _intervals(shown),
+        _INTERVALS,
     ]
     title = "Controls, sweeps and other noise"
     figure, (pair,) = _panels([shown[0].env], 0.75 + 0.25 * len(places), title, notes)
@@ -130,7 +130,8 @@ def grouped(sections: Sequence[Section]) -> Figure:
         axis.set_xlabel(metric.meaning.replace("\n", " "))
     for place, entry in enumerate(places):
         if isinstance(entry, str):
-            pair[0].text(1, place, entry, va="center", size=10.5, weight="bold", color=INK, in_layout=False)
+            look: dict[str, Any] = {"size": 10.5, "weight": "bold", "color": INK, "in_layout": False}
+            pair[0].text(1, place, entry, va="center", backgroundcolor="white", **look)
     pair[0].set_zorder(1)  # long titles reach over the other panel, where their lines are empty
     pair[0].patch.set_visible(False)
     pair[1].tick_params(labelleft=False)
@@ -169,7 +170,7 @@ def noise_curve(summary: Sequence[SummaryRow], noise_model: str | None = None) -
     if not rows:
         raise ValueError("no episodes to draw a noise curve of")
     agents, envs = _names(rows, "agent"), _names(rows, "env")
-    notes = [f"Noise: {noise_label(rows[0].noise_model)}", sample(rows, "point"), _intervals(rows)]
+    notes = [f"Noise: {noise_label(rows[0].noise_model)}", sample(rows, "point"), _INTERVALS]
     title = "Safety and reach as the obstacle readings get noisier"
     columns = max(1, _LEGEND_LETTERS // (8 + max(len(agent_label(agent)) for agent in agents)))
     legend_height = 0.12 + 0.24 * -(-len(agents) // columns)
@@ -225,11 +226,6 @@ def colour(agents: Sequence[str], agent: str) -> str:
 def spare_colour(place: int) -> str:
     """A colour for what has none of its own: the one at ``place``."""
     return _SPARE_COLOURS[place % len(_SPARE_COLOURS)]
-
-
-def _intervals(rows: Sequence[SummaryRow]) -> str:
-    """Which intervals whiskers and bands are."""
-    return "95 % bootstrap intervals" if several_seeds(rows) else "95 % Wilson intervals"
 
 
 def _names(rows: Sequence[SummaryRow], column: str) -> list[str]:

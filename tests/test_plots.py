@@ -170,13 +170,13 @@ def test_figures_say_what_they_show():
         "Franka Panda: Reach Rate",
         "Noise level 1 (fresh noise at every step)",
         "5,000 episodes per bar of 5 training seeds",
-        "95 % bootstrap intervals",
+        "95 % intervals",
         "goal reached, no collision",
         "PC-BC",
     ):
         assert part in said
     single = words(plots.comparison(make_summary(), 0.0))
-    assert "clean readings" in single and "95 % Wilson intervals" in single
+    assert "clean readings" in single and "95 % intervals" in single
 
 
 def test_noise_curve_draws_every_rate():
