@@ -26,6 +26,11 @@ pytestmark = [
 ROOT = Path(__file__).parents[1]
 RAY = str(Path(sys.executable).parent / "ray")
 SMOKE = ["--preset", "smoke", "--agents", "rise", "pcbc", "cppo", "--envs", "RISE-GroundVehicle-v0"]
+SMOKE += [
+    "--set",
+    "rise.updates=8000",
+    "pcbc.updates=8000",
+]  # long enough to be missed when their node is gone
 # Tests in the background inherit that Ctrl-C is ignored.
 COMMAND = """
 import runpy, signal
@@ -178,10 +183,11 @@ def test_a_node_that_is_lost_and_a_run_that_is_interrupted(made, tmp_path):
     out, said = tmp_path / "run", tmp_path / "said"
     with cluster(1, 1) as (address, second), said.open("w") as log:
         started = run(out, *on(address), log=log)
-        wait_for(lambda: len(list(out.glob("agents/*/*.training"))) == 2)  # one on each node
+        wait_for(lambda: all(list(out.glob(f"agents/*/{who}-*.training")) for who in ("rise", "pcbc")))
         kill(second)
-        # Ray may take half a minute to miss it, in which the other node does all that does not wait for it.
+        # Each node had one of them. Until Ray misses the lost one, the other does all that does not wait for it.
         wait_for(lambda: "attempt 2 of 3" in said.read_text() or started.poll() is not None)
+        assert started.poll() is None, said.read_text()
         os.killpg(started.pid, signal.SIGINT)
         started.wait(120)
     error = said.read_text()
