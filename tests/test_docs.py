@@ -447,8 +447,7 @@ def test_the_table_of_limits_is_what_the_trials_say(monkeypatch):
             best = ranking.best_clean(last.values())
             for agent in agents:
                 own = {trial: rates for (name, trial), rates in last.items() if name == agent}
-                episodes = 3 * 1_000
-                (first, *_) = ranking.ranked(own, float(limit.split(",")[0]) / 100, best, episodes)
+                first = ranking.ranked(own, float(limit.split(",")[0]) / 100, best, episodes=3 * 1_000)[0]
                 found.append(f"{100 * own[first].score:.1f}")
         assert scores == found, limit
 
