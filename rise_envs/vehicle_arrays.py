@@ -23,6 +23,7 @@ from rise_envs.vehicle_dynamics import (
     placed_disc,
     reward,
     swept_clearance,
+    turn,
 )
 from rise_envs.vehicle_world import Outcome, World, check_fair, copied
 
@@ -39,12 +40,13 @@ def advance(
     pose, goal_x, goal_y = (x, y, theta), goal[:, 0], goal[:, 1]
     v = clipped(action[:, 0], c.v_min, c.v_max)
     omega = clipped(action[:, 1], -c.omega_max, c.omega_max)
+    way = turn(theta, omega, c.dt)
 
     clearance: Array = None
     discs, n_count = [], disc.shape[1]
     for n in range(n_count):
         px, py, u, w, radius = (disc[:, n, i] for i in range(5))
-        near = swept_clearance(pose, v, omega, (px, py, u, w, radius), c.dt, c.robot_radius)
+        near = swept_clearance(pose, v, omega, way, (px, py, u, w, radius), c.dt, c.robot_radius)
         clearance = near if clearance is None else xp.where(near < clearance, near, clearance)
         px, py, flat = px + c.dt * u, py + c.dt * w, 0.0 * px
         there, counter = (goal_x, goal_y, 0.0), DRAWS * ((world.step + 1) * n_count + n)
@@ -52,7 +54,7 @@ def advance(
         discs.append(xp.stack((px, py, u, w, radius), axis=-1))
 
     before = gap(x, y, goal_x, goal_y)
-    x, y, theta = drive(pose, v, omega, c.dt)
+    x, y, theta = drive(pose, v, omega, way, c.dt)
     after = gap(x, y, goal_x, goal_y)
     reached, hit = after <= c.goal_radius, clearance < 0.0
     world.state, world.disc = xp.stack((x, y, theta), axis=-1), xp.stack(discs, axis=1)

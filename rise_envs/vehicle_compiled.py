@@ -26,6 +26,7 @@ from rise_envs.vehicle_dynamics import (
     packed,
     reward,
     swept_clearance,
+    turn,
     unpacked,
 )
 from rise_envs.vehicle_starts import begin, restart
@@ -37,11 +38,12 @@ Array = NDArray[np.float64]
 Whole = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
-LANES = 16
+LANES = 32
 _LARGE = 4_096  # rows
-_PIECE = 256 * LANES  # rows that one thread takes at a time: waking it takes as long as some hundred
+_PIECE = 128 * LANES  # rows that one thread takes at a time: waking it takes as long as some hundred
 _row = np.uintp  # a row's number as the compiler likes it: one that cannot count from the end
 _X, _Y, _THETA, _V, _OMEGA, _GX, _GY, _PX, _PY, _VX, _VY, _RADIUS, _LEAST = range(13)
+_SIN, _COS, _AHEAD, _ASIDE = range(13, 17)
 
 
 @compiled
@@ -67,10 +69,11 @@ def step_alone(
     v, omega = clipped(v, c.v_min, c.v_max), clipped(omega, -c.omega_max, c.omega_max)
     x, y, theta, gx, gy, least = now[0], now[1], now[2], now[3], now[4], np.inf
     shown[5], shown[6] = gx, gy
+    way = turn(theta, omega, c.dt)
     for n in range(n_count):
         d = 5 + 5 * n
         px, py, u, w, radius = now[d], now[d + 1], now[d + 2], now[d + 3], now[d + 4]
-        near = swept_clearance((x, y, theta), v, omega, (px, py, u, w, radius), c.dt, c.robot_radius)
+        near = swept_clearance((x, y, theta), v, omega, way, (px, py, u, w, radius), c.dt, c.robot_radius)
         least = where(near < least, near, least)
         px, py = px + c.dt * u, py + c.dt * w
         counter = DRAWS * ((time + 1) * n_count + n)
@@ -79,7 +82,7 @@ def step_alone(
         shown[d + 2], shown[d + 3], shown[d + 4], shown[d + 5], shown[d + 6] = px, py, u, w, radius
     before = gap(x, y, gx, gy)
     shown[-2], shown[-1] = x, y
-    x, y, theta = drive((x, y, theta), v, omega, c.dt)
+    x, y, theta = drive((x, y, theta), v, omega, way, c.dt)
     after = gap(x, y, gx, gy)
     reached = after <= c.goal_radius
     now[0], now[1], now[2] = x, y, theta
@@ -110,7 +113,8 @@ def _pass_discs(
         for m in range(LANES):
             this = (w[_PX, m], w[_PY, m], w[_VX, m], w[_VY, m], w[_RADIUS, m])
             pose = (w[_X, m], w[_Y, m], w[_THETA, m])
-            near = swept_clearance(pose, w[_V, m], w[_OMEGA, m], this, c.dt, c.robot_radius)
+            way = (w[_SIN, m], w[_COS, m], w[_AHEAD, m], w[_ASIDE, m])
+            near = swept_clearance(pose, w[_V, m], w[_OMEGA, m], way, this, c.dt, c.robot_radius)
             w[_LEAST, m] = where(near < w[_LEAST, m], near, w[_LEAST, m])
         for m in range(LANES):
             u, v = w[_VX, m], w[_VY, m]
@@ -152,7 +156,7 @@ def _advance(
     truncated: Flags,
 ) -> None:
     """Rows ``first`` to ``last`` of `advance`; from ``seen`` on the parts of the outcome."""
-    c, w = unpacked(numbers), aligned(13)
+    c, w = unpacked(numbers), aligned(17)
     for start in range(first, last, LANES):
         count = min(LANES, last - start)
         for m in range(LANES):
@@ -163,6 +167,8 @@ def _advance(
         for m in range(LANES):
             w[_V, m] = clipped(w[_V, m], c.v_min, c.v_max)
             w[_OMEGA, m] = clipped(w[_OMEGA, m], -c.omega_max, c.omega_max)
+            sin, cos, ahead, aside = turn(w[_THETA, m], w[_OMEGA, m], c.dt)
+            w[_SIN, m], w[_COS, m], w[_AHEAD, m], w[_ASIDE, m] = sin, cos, ahead, aside
         _pass_discs(start, count, w, disc, key, time, obstacle, c)
         for m in range(count):
             b = _row(start + m)
@@ -170,7 +176,8 @@ def _advance(
         for m in range(LANES):
             x, y, theta, gx, gy = w[_X, m], w[_Y, m], w[_THETA, m], w[_GX, m], w[_GY, m]
             before = gap(x, y, gx, gy)
-            x, y, theta = drive((x, y, theta), w[_V, m], w[_OMEGA, m], c.dt)
+            way = (w[_SIN, m], w[_COS, m], w[_AHEAD, m], w[_ASIDE, m])
+            x, y, theta = drive((x, y, theta), w[_V, m], w[_OMEGA, m], way, c.dt)
             after = gap(x, y, gx, gy)
             arrived = after <= c.goal_radius
             w[_X, m], w[_Y, m], w[_THETA, m] = x, y, theta

@@ -18,6 +18,7 @@ from rise_envs.obstacles import DRAWS, Rules, drawn_velocity, kept, outside
 
 Pose = tuple[Number, Number, Number]  # x, y (m), θ (rad)
 Disc = tuple[Number, Number, Number, Number, Number]  # px, py (m), vx, vy (m/s), r (m)
+Turn = tuple[Number, Number, Number, Number]  # sin θ, cos θ; how far the arc of a step gets, ahead and aside
 
 Array = NDArray[np.float64]
 
@@ -89,40 +90,45 @@ def clipped(x: Number, low: float, high: float) -> Number:
     return where(x > high, high, x)
 
 
-def drive(pose: Pose, v: Number, omega: Number, t: Number) -> Pose:
-    """The unicycle's pose (x, y, θ) after driving a constant (v, ω) for ``t`` seconds, exactly; −1 ≤ ωt ≤ 1."""
-    x, y, theta = pose
-    sin, cos = sincos(theta)
-    ahead, aside = arc(omega * t)
-    way = v * t
+def turn(theta: Number, omega: Number, dt: float) -> Turn:
+    """What drive and clearance share of a step of ``dt`` seconds; −1 ≤ ω · dt ≤ 1."""
+    return (*sincos(theta), *arc(omega * dt))
+
+
+def drive(pose: Pose, v: Number, omega: Number, turn: Turn, dt: float) -> Pose:
+    """The unicycle's pose (x, y, θ) after driving a constant (v, ω) for ``dt`` seconds, exactly."""
+    (x, y, theta), (sin, cos, ahead, aside) = pose, turn
+    way = v * dt
     ahead, aside = way * ahead, way * aside
-    return x + (cos * ahead - sin * aside), y + (sin * ahead + cos * aside), wrap_angle(theta + omega * t)
+    return x + (cos * ahead - sin * aside), y + (sin * ahead + cos * aside), wrap_angle(theta + omega * dt)
 
 
-def _squared_gap(v: Number, omega: Number, x: Number, y: Number, u: Number, w: Number, t: Number) -> Number:
+def _squared_gap(
+    v: Number, arc: tuple[Number, Number], x: Number, y: Number, u: Number, w: Number, t: Number
+) -> Number:
     """Squared distance of the centres ``t`` seconds on; the disc in the frame that the vehicle starts in."""
-    ahead, aside = arc(omega * t)
     way = v * t
-    dx, dy = way * ahead - (x + t * u), way * aside - (y + t * w)
+    dx, dy = way * arc[0] - (x + t * u), way * arc[1] - (y + t * w)
     return dx * dx + dy * dy
 
 
 def swept_clearance(
-    pose: Pose, v: Number, omega: Number, disc: Disc, dt: float, robot_radius: float
+    pose: Pose, v: Number, omega: Number, turn: Turn, disc: Disc, dt: float, robot_radius: float
 ) -> Number:
     """Least signed distance (m) to a disc over one step: see :func:`rise_envs.geometry.swept_clearance`."""
-    (x, y, theta), (px, py, u, w, radius) = pose, disc
-    sin, cos = sincos(theta)
+    (x, y, _), (sin, cos, ahead, aside), (px, py, u, w, radius) = pose, turn, disc
+    half = 0.5 * dt
     dx, dy = px - x, py - y
     dx, dy = cos * dx + sin * dy, cos * dy - sin * dx
     u, w = cos * u + sin * w, cos * w - sin * u
     first = dx * dx + dy * dy
-    middle = _squared_gap(v, omega, dx, dy, u, w, 0.5 * dt)
-    last = _squared_gap(v, omega, dx, dy, u, w, dt)
+    middle = _squared_gap(v, arc(omega * half), dx, dy, u, w, half)
+    last = _squared_gap(v, (ahead, aside), dx, dy, u, w, dt)
     bend = first - 2.0 * middle + last
     vertex = 0.5 + (first - last) / (4.0 * where(bend > 0.0, bend, 1.0))
     vertex = clipped(where(bend > 0.0, vertex, 0.0), 0.0, 1.0)
-    nearest = _squared_gap(v, omega, dx, dy, u, w, dt * vertex)
+    when = dt * vertex
+    nearest = _squared_gap(v, arc(omega * when), dx, dy, u, w, when)
     least = where(middle < first, middle, first)
     least = where(last < least, last, least)
     least = where(nearest < least, nearest, least)
