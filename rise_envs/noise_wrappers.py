@@ -19,7 +19,7 @@ Both follow the same rules.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -128,6 +128,15 @@ def _noise_seeds(options: dict[str, Any] | None, n: int) -> tuple[list[int] | No
     return np.broadcast_to(seeds, n).tolist(), rest or None
 
 
+def _plain(argument: Any) -> Any:
+    """Arrays as lists, and NumPy's numbers as Python's: what JSON knows."""
+    if isinstance(argument, Mapping):
+        return {key: _plain(value) for key, value in argument.items()}
+    if isinstance(argument, list | tuple):
+        return [_plain(value) for value in argument]
+    return argument.tolist() if hasattr(argument, "tolist") else argument
+
+
 class _Noisy(RecordConstructorArgs):
     """What both wrappers do with their arguments."""
 
@@ -150,8 +159,8 @@ class _Noisy(RecordConstructorArgs):
             noise=text or noise,
             keys=keys,
             noise_level=noise_level,
-            noise_scale=noise_scale,
-            noise_channels=noise_channels,
+            noise_scale=_plain(noise_scale),
+            noise_channels=_plain(noise_channels),
         )
         self.channels = Channels.of(space, keys)
         scale = self.channels.scale(noise_scale, _published(self.env, "noise_scale"))

@@ -265,8 +265,10 @@ def test_groups_of_several_obstacles_and_of_several_keys():
     assert ((observation["obstacle"] != clean["obstacle"]) == [[True, False], [False, True]]).all()
 
 
-def test_a_spec_keeps_groups():
-    env = ObservationNoise(vehicle(), "step@mine", noise_channels={"obstacle": {"mine": [4]}})
+@pytest.mark.parametrize("array", [list, np.array])
+def test_a_spec_keeps_groups_and_scale(array):
+    scale, groups = {"obstacle": array([0.5, 1.0, 1.0, 1.0, 2.0])}, {"obstacle": {"mine": array([0, 4])}}
+    env = ObservationNoise(vehicle(), "step@mine", noise_scale=scale, noise_channels=groups)
     again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
     assert_equal(episode(again, seed=1)[0], episode(env, seed=1)[0])
 
