@@ -1,6 +1,9 @@
-"""Where one may look for it: ``python -m rise_agents.play`` drives, as it keeps demonstrations, which are of there."""
+"""``python -m rise_envs.play``: drives an environment with the keyboard, by :mod:`rise_agents.play`.
+
+That stands where demonstrations are, which it keeps; nothing else here knows of that package.
+"""
+
+import runpy
 
 if __name__ == "__main__":
-    raise SystemExit(
-        "rise_envs.play: to drive with the keyboard: python -m rise_agents.play RISE-GroundVehicle-v0"
-    )
+    runpy.run_module("rise_agents.play", run_name="__main__", alter_sys=True)

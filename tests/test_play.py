@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import runpy
+import sys
 
 import gymnasium as gym
 import numpy as np
@@ -237,6 +238,10 @@ def test_the_keys_of_the_arm_are_as_the_camera_sees_it():
             assert shift @ towards[key] > 0.5 * np.abs(shift).max()
 
 
-def test_who_looks_for_it_among_the_environments_is_told():
-    with pytest.raises(SystemExit, match=r"python -m rise_agents\.play"):
+def test_it_can_be_called_by_the_name_of_the_environments(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["play", "RISE-GroundVehicel-v0"])
+    monkeypatch.delitem(sys.modules, "rise_agents.play")
+    with pytest.raises(SystemExit) as end:
         runpy.run_module("rise_envs.play", run_name="__main__")
+    assert end.value.code == 2
+    assert "did you mean 'RISE-GroundVehicle-v0'" in capsys.readouterr().err
