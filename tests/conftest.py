@@ -24,10 +24,16 @@ os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
 
 
 @pytest.fixture(autouse=True, scope="session")
-def temporary_files(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """What libraries and killed processes leave among temporary files goes when pytest's own does."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("TMPDIR", str(tmp_path_factory.mktemp("left")))
+def temporary_files() -> Iterator[None]:
+    """What libraries and killed processes leave among temporary files goes with the tests.
+
+    The folder's name is short, as names of sockets must be.
+    """
+    with (
+        tempfile.TemporaryDirectory(prefix="rise-", ignore_cleanup_errors=True) as folder,
+        pytest.MonkeyPatch.context() as patch,
+    ):
+        patch.setenv("TMPDIR", folder)
         patch.setattr(tempfile, "tempdir", None)
         yield
 
