@@ -127,9 +127,10 @@ def _both_rates(rows: Sequence[SummaryRow], agents: Sequence[str]) -> Chart:
 
 
 def _front_at(rows: Sequence[SummaryRow], agents: Sequence[str]) -> list[Chart]:
-    """A mark with both intervals per agent at one level, and a line that joins those that no other beats in both."""
+    """A mark with both intervals per agent at one level, and rings around the Pareto front, joined by a line."""
     marks = [
         _both_rates([row], agents)
+        | {"marker": _style(agents, row.agent, n)["marker"] | {"size": max(9, 17 - 3 * n)}}
         | {
             f"error_{axis}": {
                 "type": "data",
@@ -141,13 +142,14 @@ def _front_at(rows: Sequence[SummaryRow], agents: Sequence[str]) -> list[Chart]:
             }
             for axis, metric in zip("xy", METRICS, strict=True)
         }
-        for row in rows
+        for n, row in enumerate(rows)  # later ones are smaller: of marks in one place all can be seen
     ]
     best = front([(row.safety_rate, row.reach_rate) for row in rows])
     joined = {
         "type": "scatter",
-        "mode": "lines",
-        "name": "no other is better in both",
+        "mode": "lines+markers",
+        "marker": {"color": "#888888", "symbol": "circle-open", "size": 24},
+        "name": "Pareto front",
         "x": [_percent(x) for x, _ in best],
         "y": [_percent(y) for _, y in best],
         "line": {"dash": "dot", "width": 1.5, "color": "#888888"},

@@ -9,7 +9,9 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from rise_agents import __version__
 from rise_agents.agent import nearest
+from rise_agents.cli import command
 
 
 class Command(NamedTuple):
@@ -63,7 +65,7 @@ agents, presets and the like, at the TAB key.
 def help_text() -> str:
     """What ``--help`` says."""
     width = max(map(len, COMMANDS))
-    lines = [f"  {name:<{width}}  {command.line}" for name, command in COMMANDS.items()]
+    lines = [f"  {name:<{width}}  {each.line}" for name, each in COMMANDS.items()]
     return "\n".join(["usage: rise-bench COMMAND [options]", "", "commands:", *lines, "", _EXAMPLES.rstrip()])
 
 
@@ -105,11 +107,11 @@ def completion(shell: str) -> str:
         raise ValueError("completion needs one more package: pip install 'rise-suite[completion]'") from None
     whole = argparse.ArgumentParser(prog="rise-bench")
     commands, names = whole.add_subparsers(), known_names()
-    for name, command in COMMANDS.items():
-        own = importlib.import_module(command.module).parser()
+    for name, each in COMMANDS.items():
+        own = importlib.import_module(each.module).parser()
         for action in own._actions:
             _complete(action, names, shtab)
-        commands.add_parser(name, help=command.line, parents=[own], add_help=False)
+        commands.add_parser(name, help=each.line, parents=[own], add_help=False)
     return shtab.complete(whole, shell)
 
 
@@ -123,24 +125,22 @@ def _complete(action: argparse.Action, names: dict[str, Iterable[str]], shtab: A
         action.complete = shtab.DIRECTORY if folder else shtab.FILE  # type: ignore[attr-defined]  # shtab's way
 
 
+@command("rise-bench")
 def main(argv: Sequence[str] | None = None) -> int:
     """Hand over to a command; returns its exit code, 2 for an unknown one, 130 if interrupted."""
     words = list(sys.argv[1:] if argv is None else argv)
-    try:
-        if not words or words[0] in ("-h", "--help"):
-            print(help_text())
-            return 0 if words else 2
-        if words[0] == "--print-completion":
-            print(completion(words[1] if len(words) > 1 else ""))
-            return 0
-        if words[0] not in COMMANDS:
-            raise ValueError(f"unknown command {words[0]!r}: {nearest(words[0], COMMANDS)}")
-        return importlib.import_module(COMMANDS[words[0]].module).main(words[1:])
-    except ValueError as error:
-        print(f"rise-bench: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        return 130
+    if not words or words[0] in ("-h", "--help"):
+        print(help_text())
+        return 0 if words else 2
+    if words[0] == "--version":
+        print(f"rise-suite {__version__}")
+        return 0
+    if words[0] == "--print-completion":
+        print(completion(words[1] if len(words) > 1 else ""))
+        return 0
+    if words[0] not in COMMANDS:
+        raise ValueError(f"unknown command {words[0]!r}: {nearest(words[0], COMMANDS)}")
+    return importlib.import_module(COMMANDS[words[0]].module).main(words[1:])
 
 
 if __name__ == "__main__":

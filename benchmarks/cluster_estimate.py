@@ -40,7 +40,12 @@ def parser() -> Parser:
     p.add_argument("run", type=Path, metavar="RUN_DIR", help="folder of a run, whole or not")
     p.add_argument("--preset", default="paper", metavar="NAME", help="what is to be run (default: paper)")
     p.add_argument(
-        "--nodes", nargs="+", type=int, default=[1, 16, 128], metavar="N", help="(default: 1 16 128)"
+        "--nodes",
+        nargs="+",
+        type=int,
+        default=[1, 16, 128],
+        metavar="N",
+        help="how many there are, a line of the table each (default: 1 16 128)",
     )
     p.add_argument(
         "--cores", type=int, default=2, metavar="N", help="of a node, each with a job (default: 2)"

@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from benchmarks.jobs import Job
+from benchmarks.labels import count
 from rise_agents.agent import Progress as Tell
 
 _PLAIN_EVERY = 30.0  # s between two lines of the same job where there is no terminal
@@ -71,12 +72,16 @@ class Display:
         else:
             self.say(f"{name}: there already")
 
-    def plan(self, jobs: Sequence[Job], kinds: str = "record, train, evaluate, draw, trace") -> None:
-        """Say how many jobs there will be, and of which ``kinds``."""
+    def plan(self, jobs: Sequence[Job], title: str = "") -> None:
+        """Say how many jobs there will be, and of which kinds: their names begin with them."""
         self._jobs = len(jobs)
         there = sum(job.output.exists() for job in jobs)
         self._left = Counter(job.name for job in jobs)
-        self.say(f"{len(jobs)} jobs: {kinds}" + (f"; {there} done already" if there else ""))
+        kinds = ", ".join(dict.fromkeys(job.name.partition(" ")[0] for job in jobs))
+        self.say(
+            f"{title}{count([len(jobs)], 'job')}: {kinds or 'none'}"
+            + (f"; {there} done already" if there else "")
+        )
         if self.live:
             self._total = self.bars.add_task("[bold]all jobs", total=len(jobs), figures="")
 

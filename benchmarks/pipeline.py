@@ -147,7 +147,7 @@ def _trained(plan: Plan, out: Path) -> dict[str, dict[str, Any]]:
         for row in _trained_rows(plan, env):
             path = checkpoint_path(plan, env, row, 0, out).with_suffix(".json")
             if plan.pretrained:
-                entry = {"learned from": "before: the weights come with the package"}
+                entry = {"trained": "before; the weights come with the package"}
                 facts.setdefault(row, {})[env] = {**entry, **complete_settings(plan, env, row)}
             elif path.exists():
                 seconds = json.loads(path.read_text())["seconds"]

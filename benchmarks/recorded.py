@@ -63,8 +63,9 @@ class Run:
         for column, value in key.items():
             kept = rows.filter(pc.equal(rows[column], pa.scalar(value, results.SCHEMA.field(column).type)))
             if not kept.num_rows:
+                what = column.replace("_", " ").replace("train ", "training ")
                 raise ValueError(
-                    f"{self.folder} has no episode with {column} {value}: {_known(rows, column, value)}"
+                    f"{self.folder} has no episode with {what} {value}: {_known(rows, column, value)}"
                 )
             rows = kept
         return dict(rows.slice(0, 1).to_pylist()[0])

@@ -193,6 +193,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         raise ValueError(f"--limit must be at least 1, got {arguments.limit}")
     if arguments.unsafe and not arguments.list:
         raise ValueError("--unsafe chooses among the episodes of a --list")
+    if arguments.out and arguments.list:
+        raise ValueError("--out draws one episode: leave out --list, and name it by --agent and --scenario")
     run = open_run(arguments.run)
     name_rows(read_run(arguments.run).get("labels", {}))
     if arguments.list:

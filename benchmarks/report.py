@@ -64,10 +64,13 @@ training seed, and where all or no episodes succeeded.\
 """
 _DIFFERENCES = """\
 Differences are of the same scenarios and training seeds, in percentage points; in brackets: 95 % intervals \
-of a bootstrap that draws {} anew, each for itself. p: exact McNemar test on the episodes, of these trained \
+of a bootstrap that draws {}. p: exact McNemar test on the episodes, of these trained \
 policies, Holm-corrected over all comparisons of the task (`comparisons.csv`).\
 """
 _SURE = " It can be small where the interval, which allows for training anew, holds 0."
+_UNSURE = " It can be large where the interval, which is not corrected, does not hold 0."
+_DRAWN = {True: "training seeds and scenarios anew, each for itself", False: "scenarios anew"}
+_FEW = {"transitions": "all"}  # what 0 stands for
 _EXAMPLES = """\
 examples:
   python -m benchmarks.report runs/quick                              make its tables and figures again
@@ -172,7 +175,7 @@ def what_differences_are(summary: Sequence[SummaryRow]) -> list[str]:
     if not any(row.against for row in summary):
         return []
     seeds = several_seeds(summary)
-    return [_DIFFERENCES.format("training seeds and scenarios" if seeds else "scenarios") + _SURE * seeds]
+    return [_DIFFERENCES.format(_DRAWN[seeds]) + (_SURE if seeds else _UNSURE)]
 
 
 def _condition(row: SummaryRow) -> tuple[str, float]:
@@ -270,7 +273,10 @@ def _fact(name: str, value: Any, indent: str = "") -> list[str]:
     if not isinstance(value, Mapping):
         return [f"{indent}- {name}: {_plain(value)}"]
     if not any(isinstance(inner, Mapping) for inner in value.values()):
-        facts = ", ".join(f"{_words(key)} {_plain(inner)}" for key, inner in value.items())
+        said = {
+            key: _FEW.get(key, _plain(inner)) if inner == 0 else _plain(inner) for key, inner in value.items()
+        }
+        facts = ", ".join(f"{_words(key)} {words}" for key, words in said.items() if words)
         return [f"{indent}- **{name}**: {facts}" if facts else f"{indent}- **{name}**"]
     lines = [f"{indent}- **{name}**"]
     for key, inner in value.items():

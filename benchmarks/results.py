@@ -165,10 +165,13 @@ def read_rows(path: StrPath) -> pa.Table:
     """
     try:
         content = pa.BufferReader(Path(path).read_bytes())
+    except (OSError, ValueError) as error:  # also of a name that no file can have
+        raise ValueError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    try:
         table = pq.ParquetFile(content, page_checksum_verification=True).read(use_threads=False)
         table.validate(full=True)
         _ = table.column_names  # decodes them, which fails where they are damaged
-    except (OSError, ValueError, pa.ArrowException) as error:
+    except (OSError, ValueError, pa.ArrowException) as error:  # Arrow's own are of these kinds, too
         raise ValueError(
             f"{path}: cannot be read as results ({error}); remove it to compute it again"
         ) from None

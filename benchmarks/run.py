@@ -135,7 +135,7 @@ def parser() -> Parser:
         help="stop after so many hours: what runs is interrupted as by Ctrl-C, tables and figures show what there is,"
         " and the same command goes on (default: when all is done)",
     )
-    p.add_argument("--no-videos", action="store_true", help="skip the clips")
+    p.add_argument("--no-videos", action="store_true", help="skip the clips, and the episodes of the page")
     p.add_argument("--out", type=Path, metavar="DIR", help="run folder (default: runs/PRESET)")
     return p  # fmt: skip
 
@@ -160,14 +160,24 @@ def parse_settings(texts: Sequence[str]) -> dict[str, dict[str, Any]]:
     return settings
 
 
+def _check_nobody_trains(arguments: argparse.Namespace) -> None:
+    """Raise ``ValueError`` for what says how to train, beside --pretrained."""
+    usual = parser().parse_args([])
+    names = ("seeds", "demos", "expert", "device", "tensorboard", "checkpoint_every")
+    given = [name for name in names if getattr(arguments, name) != getattr(usual, name)]
+    if given:
+        options = " and ".join("--" + name.replace("_", "-") for name in given)
+        raise ValueError(f"--pretrained trains nobody: leave out {options}")
+
+
 def plan_of(arguments: argparse.Namespace) -> Plan:
     """The plan that the arguments ask for, every setting checked before any work starts."""
     from rise_envs import ENVS, STAND_INS
 
     if arguments.hours is not None and not 0 < arguments.hours < math.inf:
         raise ValueError(f"--hours must be a number above 0, got {arguments.hours:g}")
-    if arguments.pretrained and (arguments.seeds or arguments.demos):
-        raise ValueError("--pretrained trains nobody: leave out --seeds and --demos")
+    if arguments.pretrained:
+        _check_nobody_trains(arguments)
     reported = [env for env in ENVS if env not in STAND_INS]
     plan = make_plan(
         arguments.preset,

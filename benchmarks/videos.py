@@ -36,6 +36,7 @@ class Clip:
     outcome: str
     closest: int  # the frame after the step with the least clearance
     clearance: float  # m, least
+    ended: str = ""  # in the last picture, if not the outcome
 
 
 def film(act: Act, env_id: str, seed: int, noise_model: str, noise_level: float) -> Clip:
@@ -47,7 +48,10 @@ def film(act: Act, env_id: str, seed: int, noise_model: str, noise_level: float)
     frames: list[Frame] = []
     episode = play(act, env_id, seed, noise_model, noise_level, watch=lambda env: frames.append(_frame(env)))
     times = [i * step_seconds(env_id) for i in range(len(frames))]
-    return Clip(frames, times, outcome(episode), episode.closest, episode.outcomes["min_clearance"])
+    ended, least = outcome(episode), episode.outcomes["min_clearance"]
+    if ended == "collision":
+        ended += ", goal reached" if episode.arrived else ", goal not reached"
+    return Clip(frames, times, outcome(episode), episode.closest, least, ended)
 
 
 def outcome(episode: Trajectory) -> str:
@@ -84,8 +88,8 @@ def strip(clip: Clip, count: int = KEY_FRAMES) -> Frame:
     for n, pick in enumerate(picks):
         last, words = n == count - 1, ""
         if pick == clip.closest:
-            words = f"closest: {clip.clearance:.2f} m"
-        words = clip.outcome if last else words
+            words = f"least, within the step: {clip.clearance:.2f} m".replace("-", "−")
+        words = clip.ended or clip.outcome if last else words
         cell = Image.fromarray(
             caption(clip.frames[pick], f"t = {clip.times[pick]:.2f} s", words, _COLOURS[clip.outcome])
         )
@@ -99,7 +103,7 @@ def captioned(clip: Clip, title: str, mark: str = "") -> list[Frame]:
     frames: list[Frame] = []
     for i, frame in enumerate(clip.frames):
         ended = i == len(clip.frames) - 1
-        words = clip.outcome if ended else f"{mark}{clip.times[i]:.2f} s"
+        words = clip.ended or clip.outcome if ended else f"{mark}{clip.times[i]:.2f} s"
         done = caption(frame, title, words, _COLOURS[clip.outcome] if ended else "#57606a")
         frames += [done] * (HOLD if ended else 1)
     return frames

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import argparse
 import errno
+import os
 import secrets
+import select
 import stat
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -97,6 +99,17 @@ def one_line(error: Exception) -> str:
     return line
 
 
+def nobody_listens() -> bool:
+    """Whether who reads the output has gone (``… | head``); the rest then goes nowhere, without a word."""
+    output = sys.stdout.fileno()
+    pipe = select.poll()
+    pipe.register(output, 0)  # for what is told unasked: that the other end is closed
+    gone = bool(pipe.poll(0))
+    if gone:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), output)
+    return gone
+
+
 KEPT = "what is finished is kept, run the command again to go on"
 INTERRUPTED = f"interrupted; {KEPT}"
 
@@ -138,11 +151,15 @@ def command(
         @wraps(main)
         def ending(argv: Sequence[str] | None = None) -> int:
             try:
-                return main(argv)
+                code = main(argv)
+                sys.stdout.flush()
+                return code
             except KeyboardInterrupt:
                 print(f"\n{name}: {interrupted}", file=sys.stderr)
                 return 130
             except kinds as error:
+                if isinstance(error, BrokenPipeError) and nobody_listens():
+                    return 1
                 print(f"{name}: {one_line(error)}", file=sys.stderr)
                 if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:
                     return 2  # such a name can only have been given

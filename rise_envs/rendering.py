@@ -245,7 +245,7 @@ def _draw_strip(canvas: Canvas, time: float, clearance: float, as_read: bool) ->
     pygame.draw.line(canvas.surface, BORDER, (0, SIZE * s), (SIZE * s, SIZE * s), s)
     _write(canvas, f"{time:.1f} s", 14 * s, INK)
     text = f"clearance {clearance:.2f} m" if clearance >= 0 else f"collision {clearance:.2f} m"
-    _write(canvas, text, 74 * s, INK if clearance >= 0 else WARNING)
+    _write(canvas, text.replace("-", "−"), 74 * s, INK if clearance >= 0 else WARNING)
     legend = [(216, "start"), (284, "goal"), (348, "obstacle, true")]
     for x, name in [*legend, (477, "obstacle, as read")] if as_read else legend:
         _draw_symbol(canvas, canvas.point(x * s, (SIZE + STRIP / 2) * s), name)
@@ -265,6 +265,20 @@ def _draw_symbol(canvas: Canvas, at: Array, name: str) -> None:
         canvas.dashed_ring(at, radius, READING, 2.0)
 
 
+def _screen(size: tuple[int, int]) -> pygame.Surface:
+    """A window of the size (W, H), px."""
+    try:
+        pygame.display.init()
+        screen = pygame.display.set_mode(size)
+        # What SDL falls back to, so that nobody sees anything.
+        if pygame.display.get_driver() == "offscreen" != os.environ.get("SDL_VIDEODRIVER"):
+            raise pygame.error("no display; DISPLAY or WAYLAND_DISPLAY name one")
+    except pygame.error as error:
+        pygame.display.quit()
+        raise pygame.error(f"no window can be opened here: {error}") from None
+    return screen
+
+
 class Window:
     """A window on the screen that shows pictures at a steady rate.
 
@@ -272,11 +286,13 @@ class Window:
         shape: (H, W, 3) of the pictures.
         fps: pictures per second.
         title: of the window.
+
+    Raises:
+        pygame.error: there is no display.
     """
 
     def __init__(self, shape: tuple[int, ...], fps: float, title: str = "RISE") -> None:
-        pygame.display.init()
-        self._screen: pygame.Surface | None = pygame.display.set_mode((shape[1], shape[0]))
+        self._screen: pygame.Surface | None = _screen((shape[1], shape[0]))
         pygame.display.set_caption(title)
         self._clock, self._fps = pygame.time.Clock(), fps
 

@@ -276,6 +276,21 @@ def test_collisions_can_be_picked_out(page):
     assert page.locator("#player [data-part=rows] tr").count() >= 1
 
 
+def test_where_no_episode_fits_none_is_shown(page):
+    found = set()
+    for agent in page.locator("#player [data-part=agent] option").all():
+        choose(page, "agent", agent.get_attribute("value"))
+        for level in page.locator("#player [data-part=level] option").all():
+            choose(page, "level", level.get_attribute("value"))
+            for which in ("unsafe", "critical"):
+                choose(page, "which", which)
+                some = page.locator("#player [data-part=rows] tr").count() > 0
+                assert page.locator("#player [data-part=panels]").is_visible() == some
+                assert page.get_by_text("No such episode").is_visible() == (not some)
+                found.add(some)
+    assert found == {True, False}
+
+
 def test_charts_are_drawn(page):
     assert page.locator(".chart .main-svg").count() >= 8
     assert page.locator(".chart .bars path").count() >= 8

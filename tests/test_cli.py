@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -163,6 +164,16 @@ def test_a_command_of_the_door_can_be_repeated_from_its_record(tmp_path):
 
 
 # --- how commands end ----------------------------------------------------------------------------------------------
+
+
+def test_who_reads_may_go_before_the_end():
+    """As in ``rise-bench --help | head -0``."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    command = [sys.executable, "-m", "benchmarks.cli", "--help"]
+    done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, check=False, cwd=ROOT)
+    os.close(writing)
+    assert (done.returncode, done.stderr) == (1, "")
 
 
 class Narrow(OSError):

@@ -222,7 +222,10 @@ def test_without_a_screen(monkeypatch, capsys):
 
     monkeypatch.setattr(pygame.display, "set_mode", none)
     assert main([VEHICLE]) == 1
-    assert capsys.readouterr().err == "rise_agents.play: No available video device\n"
+    assert (
+        capsys.readouterr().err
+        == "rise_agents.play: no window can be opened here: No available video device\n"
+    )
 
 
 def test_the_keys_of_the_arm_are_as_the_camera_sees_it():

@@ -382,3 +382,9 @@ def test_a_damaged_file_of_the_package_is_told_at_once(shipped, tmp_path, capsys
 
 def test_the_experts_need_no_weights(folder, tmp_path):
     assert run([*COMMAND, "--agents", "random", "--no-videos", "--out", str(tmp_path / "out")]) == 0
+
+
+@pytest.mark.parametrize("given", [["--seeds", "2"], ["--expert", "cbf"], ["--tensorboard", "events"]])
+def test_who_trains_nobody_is_not_told_how_to(given, capsys):
+    assert run([*COMMAND, *given]) == 2
+    assert f"--pretrained trains nobody: leave out {given[0]}\n" in capsys.readouterr().err

@@ -142,7 +142,7 @@ def test_a_folder_that_is_none_is_told_in_one_line_before_any_work(docs, tmp_pat
     (folder / "episodes.parquet").write_bytes((docs / "episodes.parquet").read_bytes()[:-50])
     refused("cannot be read as results")
     (folder / "episodes.parquet").unlink()
-    refused("cannot be read as results")
+    refused("cannot be read: No such file")
 
 
 # --- what is the same ------------------------------------------------------------------------------------------

@@ -190,6 +190,16 @@ def test_human_mode_opens_and_closes_a_window(no_screen: None) -> None:
     env.close()
 
 
+def test_where_there_is_no_display_no_window_seems_to_open(monkeypatch: pytest.MonkeyPatch) -> None:
+    """SDL would draw into nothing, and who is to drive would wait for a window."""
+    pygame.display.quit()
+    for name in ("SDL_VIDEODRIVER", "DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(pygame.error, match="no window can be opened here"):
+        rendering.Window((10, 10, 3), fps=1000)
+    assert not pygame.display.get_init()
+
+
 def test_a_window_closed_by_its_user_stays_closed(no_screen: None) -> None:
     window = rendering.Window((SIZE + STRIP, SIZE, 3), fps=1000)
     window.show(scene())

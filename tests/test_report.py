@@ -95,14 +95,17 @@ def test_page_shows_figures_and_links_films():
 
 def test_page_says_how_agents_were_trained_and_how_to_repeat():
     facts = {
-        "rise": {VEHICLE: {"beta": 0.03, "hidden": [128, 128], "n_demos": 2000}, PANDA: {"frame": "hand"}}
+        "rise": {
+            VEHICLE: {"beta": 0.03, "hidden": [128, 128], "n_demos": 2000, "transitions": 0},
+            PANDA: {"frame": "hand", "train_env": "", "average": 0},
+        }
     }
     agents = facts | {"pcbc": {"layer_norm": True, "epochs": 3}, "cppo": "not trained here", "expert": {}}
     page = report.summary_markdown(SUMMARY, RUN | {"training": agents})
     assert (
         "- **RISE**\n"
-        "  - **Ground vehicle**: beta 0.03, hidden [128, 128], n demos 2,000\n"
-        "  - **Franka Panda**: frame hand\n"
+        "  - **Ground vehicle**: beta 0.03, hidden [128, 128], n demos 2,000, transitions all\n"
+        "  - **Franka Panda**: frame hand, average 0\n"
         "- **PC-BC**: layer norm yes, epochs 3\n"
         "- C-PPO: not trained here\n"
         "- **Expert**\n"
@@ -139,7 +142,7 @@ def test_page_states_how_the_first_agent_differs_from_every_other():
         "without collision in as many [−1.2, 1.2], no difference that these episodes can show.\n\n"
     ) in page
     assert page.count("RISE kept") == 3  # one rate, two claims: nothing of level 0
-    assert "exact McNemar test" in page and "draws scenarios anew, each for itself" in page
+    assert "exact McNemar test" in page and "of a bootstrap that draws scenarios anew. p:" in page
     assert "McNemar" not in report.summary_markdown([row()], RUN)
 
 

@@ -156,5 +156,5 @@ def test_no_damaged_file_is_read_as_something_else(tmp_path):
             assert results.read_rows(path).equals(rows)
         except ValueError as error:
             assert str(path) in str(error)
-    with pytest.raises(ValueError, match=r"absent\.parquet: cannot be read"):
+    with pytest.raises(ValueError, match=r"absent\.parquet cannot be read: No such file"):
         results.read_rows(tmp_path / "absent.parquet")

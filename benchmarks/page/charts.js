@@ -24,7 +24,12 @@ function themed(layout, height) {
 function inked(data) {
   const ink = colour("ink");
   const bars = (one, axis) => (one[axis] ? { [axis]: { color: ink, thickness: 1.3, width: 3, ...one[axis] } } : {});
-  return data.map((one) => ({ ...one, ...bars(one, "error_x"), ...bars(one, "error_y") }));
+  const lit = (part) => (part ? { ...part, color: Array.isArray(part.color) ? part.color.map(seen) : seen(part.color) } : part);
+  return data.map((one) => {
+    const made = { ...one, ...bars(one, "error_x"), ...bars(one, "error_y") };
+    for (const name of ["marker", "line", "error_x", "error_y"]) if (made[name]) made[name] = lit(made[name]);
+    return made;
+  });
 }
 
 function draw(box, chart) {

@@ -43,7 +43,9 @@ class Explorer {
     }
     this.list();
     const there = what !== "task" && this.rows.some((row) => row.scenario === before);
+    this.part("watched").hidden = !this.rows.length;
     if (this.rows.length) this.watch(there ? before : this.rows[0].scenario);
+    else if (this.playing) this.toggle();
   }
 
   episode(agent, scenario) {

@@ -5,10 +5,12 @@ const DISC_ARROW = 2, ROBOT_ARROW = { 2: 1, 3: 0.2 }; // s: arrows show where th
 
 class Scene {
   constructor(canvas, task, colourOfRobot) {
-    Object.assign(this, { canvas, task, robot: colourOfRobot, context: canvas.getContext("2d") });
+    Object.assign(this, { canvas, task, paint: colourOfRobot, context: canvas.getContext("2d") });
     this.angle = { turn: -0.62, rise: 0.42 };
     if (task.dim === 3) this.orbit();
   }
+
+  get robot() { return seen(this.paint); }
 
   show(episode, data, bounds) {
     Object.assign(this, { episode, data, bounds });
@@ -136,7 +138,7 @@ function drawPath(c, scene, moment, at) {
   const points = [];
   for (let t = 0; t <= scene.episode.steps; t++) points.push(at(scene.data.position(t)));
   const here = at(moment.position), before = points.slice(0, moment.step + 1).concat([here]);
-  for (const [list, alpha] of [[[here].concat(points.slice(moment.step + 1)), 0.4], [before, 1]]) {
+  for (const [list, alpha] of [[[here].concat(points.slice(moment.step + 1)), 0.5], [before, 1]]) {
     c.globalAlpha = alpha;
     c.strokeStyle = scene.robot;
     c.lineWidth = 2.2;

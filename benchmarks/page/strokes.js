@@ -7,6 +7,14 @@ const scaled = (a, times) => a.map((value) => times * value);
 const dot = (a, b) => a.reduce((sum, value, i) => sum + value * b[i], 0);
 const cross3 = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 
+const dark = matchMedia("(prefers-color-scheme: dark)");
+
+// A colour "#rrggbb" that is seen on the page: on a dark one nearer to white, as those of agents are made for a light one.
+function seen(paint) {
+  if (!dark.matches || !/^#[0-9a-f]{6}$/i.test(paint ?? "")) return paint;
+  return `#${[1, 3, 5].map((i) => Math.round(0.6 * parseInt(paint.slice(i, i + 2), 16) + 0.4 * 255).toString(16).padStart(2, "0")).join("")}`;
+}
+
 function line(c, a, b) {
   c.beginPath();
   c.moveTo(...a);

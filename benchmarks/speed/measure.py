@@ -97,8 +97,8 @@ class Row:
 class Result:
     """A measured row, as in ``speed.csv``; None where nothing was measured.
 
-    ``ratio`` is that of the medians; ``ratio_low`` and ``ratio_high`` are the quartiles of the ratios of
-    neighbouring measurements.
+    ``ratio``, ``ratio_low`` and ``ratio_high`` are the median and the quartiles of the ratios of neighbouring
+    measurements.
     """
 
     name: str
@@ -142,13 +142,12 @@ def take_turns(
 
 
 def summarise(row: Row, ours: Sequence[float], peers: Sequence[float], note: str = "") -> Result:
-    """Medians, their ratio, and whether the target is met."""
+    """Medians, also of the ratios, and whether the target is met."""
     value = float(np.median(ours))
     peer_value = ratio = low = high = None
     if peers:
         peer_value = float(np.median(peers))
-        ratio = value / peer_value
-        low, high = (float(q) for q in np.percentile(np.divide(ours, peers), (25, 75)))
+        low, ratio, high = (float(q) for q in np.percentile(np.divide(ours, peers), (25, 50, 75)))
     target = met = ""
     if row.target:
         target = row.target.text("×" if peers else row.unit)

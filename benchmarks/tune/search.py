@@ -153,7 +153,7 @@ def execute(search: Search, sets: Mapping[str, tuple[Path, str]], out: Path, how
         taken = known.recall(studies, search.plan.seeds, how.known, out)
         print(f"taken from an earlier search: {count([taken], 'result')}", file=sys.stderr)
     first = {study: range(len(study.trials)) for study in studies}
-    failures += _run(_jobs(first, [0], out, how.every), how, "first round: train, judge")
+    failures += _run(_jobs(first, [0], out, how.every), how, "first round: ")
     rates = {study: _measured(study, first[study], [0], out) for study in studies}
     best = _best(rates)
     second = {
@@ -162,7 +162,7 @@ def execute(search: Search, sets: Mapping[str, tuple[Path, str]], out: Path, how
         if rates[study]
     }
     seeds = range(search.plan.seeds)
-    failures += _run(_jobs(second, seeds[1:], out, how.every), how, "second round: train, judge")
+    failures += _run(_jobs(second, seeds[1:], out, how.every), how, "second round: ")
 
     found = []
     finals = {study: _measured(study, trials, seeds, out) for study, trials in second.items()}
@@ -213,7 +213,7 @@ def _recorded(
         for job in recording_jobs(search.plan, out)
         if not any(demonstrations_folder(search.plan, env, out) in job.output.parents for env in sets)
     ]
-    failures = _run(jobs, how, "record") if jobs else []
+    failures = _run(jobs, how) if jobs else []
     sources = dict(sets)
     for env in search.plan.envs:
         folder = demonstrations_folder(search.plan, env, out)
@@ -235,9 +235,9 @@ def _jobs(trials: Mapping[Study, Iterable[int]], seeds: Iterable[int], out: Path
     return wanted(unique, [job for job in unique if job.run is judge])
 
 
-def _run(jobs: Sequence[Job], how: How, kinds: str) -> list[Failure]:
+def _run(jobs: Sequence[Job], how: How, title: str = "") -> list[Failure]:
     with Display() as display:
-        display.plan(jobs, kinds)
+        display.plan(jobs, title)
         turn = with_events(jobs, how.tensorboard)
         return run_jobs(turn, how.workers, display.watch, display.say, pool=how.pool)
 

@@ -57,14 +57,24 @@ def parser() -> Parser:
     )
     p.add_argument("--log", type=Path, metavar="FILE", help="where the run is kept (default: not)")
     p.add_argument(
-        "--stale-after", type=float, default=1.9, metavar="X", help="periods that a reading is good for"
+        "--stale-after",
+        type=float,
+        default=1.9,
+        metavar="X",
+        help="periods that a reading is good for (default: 1.9)",
     )
-    p.add_argument("--overruns", type=int, default=3, metavar="N", help="late periods in a row that stop it")
+    p.add_argument(
+        "--overruns", type=int, default=3, metavar="N", help="late periods in a row that stop it (default: 3)"
+    )
     p.add_argument(
         "--resume-after", type=float, metavar="S", help="go on after so long without trouble (default: never)"
     )
     p.add_argument(
-        "--rate-limit", type=float, nargs="+", metavar="X", help="greatest change of each action a second"
+        "--rate-limit",
+        type=float,
+        nargs="+",
+        metavar="X",
+        help="greatest change of each action a second (default: any)",
     )
     p.add_argument(
         "--spin", type=float, default=0.5, metavar="MS", help="awake before a period (default: 0.5)"
