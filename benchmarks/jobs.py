@@ -333,6 +333,12 @@ def train(
     record = {"seconds": round(resume.seconds, 1), "device": device, "curve": resume.curve}
     results.atomic_write_text(output.with_suffix(".json"), json.dumps(record) + "\n")
     learner.save(output)
+    says = checkpoint.load(output)[1].get("agent")
+    if says != agent:  # whoever loads it would get that one
+        output.unlink()
+        raise ValueError(
+            f"save() of {agent} wrote a checkpoint of {says!r}: it must write the agent's own name"
+        )
     Path(output.with_suffix(".training")).unlink(missing_ok=True)
 
 

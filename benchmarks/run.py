@@ -256,9 +256,11 @@ def time_limit(
     return lambda: clock() - started >= 3600 * hours
 
 
-def _told(outcome: Outcome, hours: float | None) -> list[str]:
+def _told(outcome: Outcome, hours: float | None, out: Path) -> list[str]:
     """What was not done, a line each."""
     lines = [f"failed: {failure.job.name}: {failure.reason}" for failure in outcome.failures]
+    if lines:
+        lines.append(f"where in the code: {out / 'failures.log'}")
     if outcome.stopped:
         left = f"{count([len(outcome.left)], 'job')} {'is' if len(outcome.left) == 1 else 'are'} left"
         lines.append(f"stopped by --hours after {hours:g} h; {left}: give the same command again to go on")
@@ -293,7 +295,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
         with sole_user(out):
             outcome = execute(plan, out, how)
-    lines = _told(outcome, arguments.hours)
+    lines = _told(outcome, arguments.hours, out)
     for line in lines:
         print(f"benchmarks.run: {line}", file=sys.stderr)
     print(f"{'Stopped' if lines else 'Finished'} after {time.perf_counter() - started:.0f} s: {out}")

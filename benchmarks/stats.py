@@ -97,7 +97,7 @@ def bootstrap_means(tables: Sequence[Table], replicates: int = REPLICATES, seed:
 
     Args:
         tables: K tables (S_k, N) with the same scenarios; S_k = 1 leaves the scenarios alone to chance.
-        replicates: R.
+        replicates: how many: R.
         seed: of the draws.
 
     Returns:

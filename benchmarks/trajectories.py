@@ -102,7 +102,10 @@ def play(
     """
     if watch is not None and not draws(env_id):
         raise ValueError(f"{env_id} draws no pictures")
-    env: gym.Env = gym.make(env_id, render_mode=None if watch is None else "rgb_array")
+    how: dict[str, Any] = (
+        {} if watch is None else {"render_mode": "rgb_array"}
+    )  # which not every environment knows
+    env: gym.Env = gym.make(env_id, **how)
     options = None
     if noise_level > 0:
         env = ObservationNoise(env, noise_model, noise_level=noise_level)

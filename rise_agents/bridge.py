@@ -31,7 +31,7 @@ class Bridge(VecEnv):
     Args:
         venv: steps B sub-environments, with ``autoreset_mode=SAME_STEP``.
         encode: from its batched observations to network inputs.
-        n_inputs: K.
+        n_inputs: how many: K.
 
     Attributes:
         costs: ``info["cost"]`` of the last step, (B,).

@@ -102,7 +102,7 @@ class NoisyReadings:
     Args:
         lesson: the demonstrations, how they are seen, and the generator to draw from.
         level: of the noise, in units of the task's ``noise_scale``.
-        copies: M.
+        copies: how many: M.
     """
 
     KEYS = ("observation", "desired_goal", "obstacle")

@@ -52,9 +52,9 @@ class Drive:
     Attributes:
         seed: of the environment.
         observations: T + 1 of them.
-        actions: T.
-        rewards: T.
-        costs: T.
+        actions: T of them.
+        rewards: T of them.
+        costs: T of them.
         arrived: whether the goal was reached.
     """
 

@@ -163,18 +163,36 @@ def check_judged(env_id: str) -> None:
         env = gym.make(env_id)
         env.reset(seed=0)
         env.action_space.seed(0)
-        infos = env.step(env.action_space.sample())[-1]
+        observation, *_, infos = env.step(env.action_space.sample())
         env.close()
     except Exception as error:  # whatever an environment of somebody else raises
         reason = (str(error).strip() or "no message").splitlines()[0]
         raise ValueError(f"{env_id} fails in its first step: {type(error).__name__}: {reason}") from error
+    _check_shapes(env_id, observation, env.observation_space)
     _check_infos(env_id, infos)
+
+
+def _check_shapes(env_id: str, observation: Any, space: gym.Space, what: str = "observation") -> None:
+    """Raise ``ValueError`` where an observation is not shaped as its space says: batches are made by that."""
+    if isinstance(space, gym.spaces.Dict):
+        for key, part in space.items():
+            if not isinstance(observation, dict) or key not in observation:
+                raise ValueError(f"{env_id} gives no {what}[{key!r}], which its observation_space has")
+            _check_shapes(env_id, observation[key], part, f"{what}[{key!r}]")
+    elif isinstance(space, gym.spaces.Box) and np.shape(observation) != space.shape:
+        shape = np.shape(observation)
+        raise ValueError(f"{env_id} gives {what} of shape {shape}, its observation_space says {space.shape}")
 
 
 def _check_infos(env_id: str, infos: dict[str, Any]) -> None:
     missing = [f"info[{name!r}]" for name in ("cost", "clearance", "is_success") if name not in infos]
     if missing:
         raise ValueError(f"{env_id} gives no {', no '.join(missing)}, by which episodes are judged")
+    cost = np.asarray(infos["cost"])
+    good = cost.dtype.kind in "biuf" and (cost >= 0) & (cost < np.inf)  # false of NaN, too
+    if not np.all(good):
+        bad = infos["cost"] if np.ndim(good) == 0 else cost[~good][0]
+        raise ValueError(f"{env_id}: the cost of a step must be a finite number ≥ 0, got {bad}")
 
 
 class _Tally:

@@ -49,8 +49,8 @@ def constrained_ppo(inputs: int, outputs: int, hidden: Sequence[int], boxes: boo
     """Of the floats that :meth:`rise_agents.constrained_ppo.ConstrainedPPO.snapshot` gives.
 
     Args:
-        inputs: K.
-        outputs: A.
+        inputs: how many: K.
+        outputs: how many: A.
         hidden: widths of all three networks.
         boxes: whether actions are continuous.
     """

@@ -21,7 +21,7 @@ class EpisodeStreams:
     """The stream of episodes of each of B sub-environments: two whole numbers, no generator.
 
     Args:
-        count: B.
+        count: how many: B.
         own: makes arrays of whatever library out of NumPy's.
     """
 
@@ -110,7 +110,7 @@ def reset_mask(options: dict[str, Any] | None, count: int, first: bool) -> NDArr
 
     Args:
         options: of ``reset``.
-        count: B.
+        count: how many: B.
         first: whether nothing was started yet.
 
     Raises:

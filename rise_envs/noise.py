@@ -196,22 +196,36 @@ def _written(model: NoiseModel) -> str:
 def corrupt(
     noise: str | NoiseModel, readings: Array, scale: ArrayLike, keys: Keys, groups: Groups | None = None
 ) -> Array:
-    """Recorded readings (B, T, C) with noise, as the wrappers hand them out for the same keys.
+    """Recorded readings (B, T, C) with noise, as the wrappers hand them out.
 
     Args:
         noise: a model or its text.
         readings: clean readings of B episodes in T steps, the first read at the reset.
         scale: unit of each channel, (C,) or a scalar.
-        keys: noise key of each episode, (B,).
+        keys: of the episodes, (B,), whole numbers ≥ 0: each names the noise of one. Those of
+            :func:`rise_envs.noise_wrappers.noise_keys` give the noise of a wrapper's ``options["noise_seed"]``.
         groups: the channels of each group that can stand after an ``@``, as in ``Task.noise_channels``.
 
     Returns:
         Noisy readings, (B, T, C).
+
+    Raises:
+        ValueError: arguments of other shapes, readings that are not finite, or a scale that is not finite and ≥ 0.
     """
-    model = make_noise(noise, groups=groups)
+    model, readings, numbers = make_noise(noise, groups=groups), np.asarray(readings), np.asarray(keys)
+    if readings.ndim != 3 or not np.isfinite(readings).all():
+        raise ValueError(
+            f"readings must be finite, (episodes, steps, channels), got shape {readings.shape}, the least "
+            f"{readings.min(initial=np.inf)}, the greatest {readings.max(initial=-np.inf)}"
+        )
     n_episodes, n_steps, channels = readings.shape
-    unit = np.broadcast_to(np.asarray(scale, dtype=np.float64), channels)
-    state = model.reset(keys, channels)
+    unit = np.asarray(scale, dtype=np.float64)
+    if unit.shape not in ((), (channels,)) or not ((unit >= 0) & (unit < np.inf)).all():
+        raise ValueError(f"scale must be a finite number ≥ 0, or {channels} of them, got {scale!r}")
+    if numbers.shape != (n_episodes,) or numbers.dtype.kind not in "iu" or (numbers < 0).any():
+        raise ValueError(f"keys must be {n_episodes} whole numbers ≥ 0, one for each episode, got {keys!r}")
+    unit = np.broadcast_to(unit, channels)
+    state = model.reset(numbers.astype(np.uint64), channels)
     noisy = np.empty(readings.shape)
     for t in range(n_steps):
         noisy[:, t], state = model(readings[:, t], unit, np.full(n_episodes, t), state)

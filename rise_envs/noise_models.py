@@ -40,7 +40,7 @@ class NoiseModel(ABC):
 
         Args:
             keys: noise key of each episode, (B,).
-            channels: C.
+            channels: how many: C.
             ahead: how many steps to draw at once. Changes speed, not numbers: 64 suits one episode, 1 many.
         """
 

@@ -42,13 +42,21 @@ Rows = Any  # a mask (B,), of the library of the readings
 _STREAM, _EPISODE = 0x6E6F6973, 0x65706973
 
 
+def noise_keys(noise_seeds: Sequence[int]) -> Keys:
+    """The keys (B,) of the noise that the wrappers give to episodes with these ``options["noise_seed"]``.
+
+    For :func:`rise_envs.noise.corrupt`: what is recorded gets the noise that it would have met.
+    """
+    return streams.seed_keys(noise_seeds, _EPISODE)
+
+
 class NoiseRows:
     """The noise of B episodes that run side by side, each with its own key stream and clock.
 
     Args:
         model: of the noise.
         scale: unit of each channel, (C,).
-        n: B.
+        n: how many: B.
         ahead: how many steps are drawn at once.
         layer: how many other noise wrappers there are inside of this one.
     """

@@ -56,8 +56,8 @@ def checked_entry(kind: str, entry: Any, needs: Iterable[str] = ()) -> tuple[Any
     try:
         found = find_class(text)
     except (ImportError, AttributeError) as error:
-        hint = "; a class must stand at the top level of a module" if isinstance(entry, type) else ""
-        raise ValueError(f"{kind}: cannot find {text!r}: {error}{hint}") from None
+        why = "a class must stand at the top level of a module" if isinstance(entry, type) else error
+        raise ValueError(f"{kind}: cannot find {text!r}: {why}") from None
     if not isinstance(found, type):
         raise ValueError(f"{kind}: {text!r} is no class")
     # An abstract method is there, and is not.

@@ -121,7 +121,7 @@ def draw_vehicle_scene(
     Args:
         state: (x, y, θ), m and rad, (3,).
         goal: (2,), m.
-        n_obstacles: N.
+        n_obstacles: how many balls: N.
         reading: the true readings, (5N,).
         perceived: the readings as the agent got them, (5N,), or ``None``.
         trail: the positions (2,) since the start, one per step.

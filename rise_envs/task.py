@@ -28,7 +28,7 @@ class Task:
 
     Attributes:
         dim: D, the dimension of positions: 2 or 3.
-        n_obstacles: N.
+        n_obstacles: how many balls: N.
         noise_scale: standard deviation of each reading channel at noise level 1, (C,), in SI units.
         robot_radius: radius (m) of the ball around the reference point that stands for the robot.
         goal_radius: distance (m) between reference point and goal that counts as reached.
@@ -37,7 +37,7 @@ class Task:
         pose: maps states (B, S) to the robot's frame: position (B, D) and rotation (B, D, D), whose columns
             are the frame's axes in world coordinates.
         body_state: columns of the state that keep their meaning when the world is seen from the robot.
-        state_size: S.
+        state_size: S, the number of them in a state.
         obstacle_speed: greatest speed of a ball (m/s): speeds are drawn from U[0, obstacle_speed], directions
             uniformly.
         redraw_interval: mean time between two draws of a ball's velocity (s).

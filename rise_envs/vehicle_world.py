@@ -151,7 +151,7 @@ def sample_starts(
     Args:
         base: of :func:`rise_envs.streams.seed_bases`, (B,).
         number: of the episode since seeding, (B,) int64.
-        n_obstacles: N.
+        n_obstacles: how many balls: N.
         constants: the task.
         dynamics: :mod:`rise_envs.vehicle_compiled` or :mod:`rise_envs.vehicle_arrays`.
 

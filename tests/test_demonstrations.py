@@ -217,8 +217,17 @@ def test_a_set_has_episodes():
             generate(VEHICLE, "cbf", episodes=number)
 
 
-def test_a_minari_set_of_noisy_readings_is_refused(vehicle_demonstrations, tmp_path, monkeypatch):
-    """A collector around a noise wrapper records what was read, and the truth beside it."""
+@pytest.mark.parametrize(
+    ("infos", "reason"),
+    [
+        # A collector around a noise wrapper records what was read, and the truth beside it.
+        (("cost", "clean_observation"), "noise wrapper"),
+        ((), "infos have no 'cost'"),
+    ],
+)
+def test_a_minari_set_without_costs_or_of_noisy_readings_is_refused(
+    vehicle_demonstrations, tmp_path, monkeypatch, infos, reason
+):
     import minari
     from minari.data_collector import EpisodeBuffer
 
@@ -229,12 +238,12 @@ def test_a_minari_set_of_noisy_readings_is_refused(vehicle_demonstrations, tmp_p
     episode = EpisodeBuffer(
         **{"observations": noisy, "actions": d.actions, "rewards": list(d.rewards)},
         **{"terminations": [False] * (n - 1) + [True], "truncations": [False] * n},
-        infos={"cost": np.zeros(n + 1), "clean_observation": clean},
+        infos={name: {"cost": np.zeros(n + 1), "clean_observation": clean}[name] for name in infos},
     )
     about = dict.fromkeys(("algorithm_name", "author", "author_email", "code_permalink", "description"), "me")
     about |= dict.fromkeys(("env", "eval_env"), VEHICLE)
     minari.create_dataset_from_buffers("lab/noisy-v0", [episode], **about)
-    with pytest.raises(DatasetError, match=r"'lab/noisy-v0': .* noise wrapper"):
+    with pytest.raises(DatasetError, match=rf"'lab/noisy-v0': .*{reason}"):
         minari_io.load("lab/noisy-v0", VEHICLE)
 
 

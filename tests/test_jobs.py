@@ -26,9 +26,10 @@ from benchmarks.jobs import (
 from benchmarks.labels import TRUE, split_row
 from benchmarks.policies import make_policy
 from benchmarks.protocol import Scenarios, make_plan
-from rise_agents import load_agent
+from rise_agents import load_agent, make_agent, register_agent
 from rise_agents.agent import silent
 from rise_agents.filters.kalman import KalmanFilter
+from rise_agents.pcbc import PCBC
 from rise_agents.rollout import rollout
 
 VEHICLE = "RISE-GroundVehicle-v0"
@@ -160,6 +161,27 @@ def trained(vehicle_demonstrations, tmp_path_factory):
     job.output.parent.mkdir(parents=True)
     train(job.output, silent, **{**job.arguments, "config": {**job.arguments["config"], "updates": 50}})
     return run, out, job.output
+
+
+class Impostor(PCBC):
+    """Its checkpoints are those of the agent that it was made from."""
+
+    name = "impostor"
+
+    def save(self, path):
+        trained = make_agent("pcbc", VEHICLE)
+        trained.__dict__.update(self.__dict__)
+        trained.save(path)
+
+
+def test_a_checkpoint_that_names_another_agent_is_refused(own_names, vehicle_demonstrations, tmp_path):
+    """Whoever loads it would measure that one under this one's name."""
+    register_agent("impostor", Impostor)
+    vehicle_demonstrations.save(tmp_path)
+    output = tmp_path / "impostor.rise"
+    with pytest.raises(ValueError, match="wrote a checkpoint of 'pcbc': it must write the agent's own name"):
+        train(output, silent, VEHICLE, "impostor", 0, {"updates": 1}, tmp_path, "cpu", 15.0)
+    assert not output.exists()
 
 
 def test_rows_act_as_their_names_say(trained):

@@ -433,3 +433,24 @@ def test_the_text_of_a_model_makes_it_again(model):
 )
 def test_a_model_that_no_text_makes_has_none(model):
     assert text_of(model) is None
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        (
+            {"readings": np.zeros((2, 5))},
+            r"readings must be finite, \(episodes, steps, channels\), got shape",
+        ),
+        ({"readings": np.full((2, 3, 5), np.nan)}, r"readings must be finite.*the least nan"),
+        ({"scale": -1.0}, r"scale must be a finite number ≥ 0, or 5 of them, got -1.0"),
+        ({"scale": np.ones(4)}, r"scale must be"),
+        ({"keys": np.array([7], np.uint64)}, r"keys must be 2 whole numbers ≥ 0, one for each episode"),
+        ({"keys": [0.5, 1.0]}, r"keys must be 2 whole numbers"),
+    ],
+)
+def test_what_is_corrupted_is_checked(changed, message):
+    good = {"readings": np.zeros((2, 3, 5)), "scale": 1.0, "keys": [3, 4]}
+    assert corrupt("step", **good).shape == (2, 3, 5)
+    with pytest.raises(ValueError, match=message):
+        corrupt("step", **good | changed)

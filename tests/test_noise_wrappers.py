@@ -16,7 +16,7 @@ import rise_envs
 from rise_envs import streams
 from rise_envs.noise import corrupt, make_noise
 from rise_envs.noise_models import Delay, EpisodeBias, StepNoise
-from rise_envs.noise_wrappers import ObservationNoise, VectorObservationNoise
+from rise_envs.noise_wrappers import ObservationNoise, VectorObservationNoise, noise_keys
 from rise_envs.task import task_of
 
 MODES = list(AutoresetMode)
@@ -339,6 +339,18 @@ def test_step_before_reset():
 
     with pytest.raises(gym.error.ResetNeeded):
         ObservationNoise(Careless()).step(np.zeros(2))
+
+
+def test_what_is_recorded_gets_the_noise_that_it_would_have_met():
+    seeds, noise = [5, 8], "step+drift:0.2+delay:1"
+    clean, noisy = [], []
+    for seed in seeds:
+        env = ObservationNoise(vehicle(), noise, noise_scale=0.5)
+        observation, info = env.reset(seed=0, options={"noise_seed": seed})
+        steps = [(observation, info), *(env.step(np.ones(2, np.float32))[::4] for _ in range(9))]
+        noisy.append([each["obstacle"] for each, _ in steps])
+        clean.append([info["clean_observation"]["obstacle"] for _, info in steps])
+    assert_array_equal(corrupt(noise, np.array(clean), 0.5, noise_keys(seeds)), noisy)
 
 
 @pytest.mark.parametrize("noise", ["episode", make_noise("drift:1e-05@position") + Delay(3)])

@@ -10,6 +10,7 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -23,9 +24,11 @@ from benchmarks import run as benchmark
 from benchmarks.policies import Random
 from benchmarks.results import read_rows
 from benchmarks.trajectories import draws
+from benchmarks.trajectories import play as play_episode
 from rise_agents import AGENTS, make_agent, play, register_agent
 from rise_agents.demonstrations import __main__ as demonstrations
 from rise_agents.demonstrations import generate
+from rise_agents.demonstrations.dataset import OBSERVATIONS
 from rise_agents.experts import make_expert, register_expert
 from rise_agents.filters import FILTERS, make_filter, register_filter
 from rise_agents.plugins import import_modules, imported
@@ -442,13 +445,67 @@ class Broken(toy_envs.Walk):
         raise LookupError("no wheels")
 
 
+class Judged(toy_envs.Walk):
+    """A walk with all that episodes are judged by."""
+
+    COST: ClassVar = 0.0
+
+    def __init__(self, render_mode=None):
+        super().__init__()
+
+    def step(self, action):
+        *rest, info = super().step(action)
+        return *rest, info | {"cost": self.COST, "clearance": 1.0, "is_success": False}
+
+
+class Paid(Judged):
+    COST = -1.0
+
+
+class Lost(Judged):
+    COST = np.nan
+
+
+class Free(Judged):
+    COST = None
+
+
+class Flat(Judged):
+    def step(self, action):
+        observation, *rest = super().step(action)
+        return observation[:1], *rest
+
+
+class Later(Judged):
+    """Its cost is none in its second step only."""
+
+    def step(self, action):
+        self.COST = getattr(self, "after", 0.0)
+        self.after = -1.0
+        return super().step(action)
+
+
+def test_a_cost_that_is_none_is_found_in_later_steps_too():
+    register_env("Mine-v0", Later, 20)
+    check_judged("Mine-v0")
+    with pytest.raises(
+        ValueError, match=r"Mine-v0: the cost of a step must be a finite number ≥ 0, got -1.0"
+    ):
+        rollout(Random("Mine-v0"), "Mine-v0", [0, 1])
+
+
 @pytest.mark.parametrize(
     ("kind", "message"),
     [
         (toy_envs.Walk, r"Mine-v0 gives no info\['clearance'\], no info\['is_success'\]"),
         (Broken, r"Mine-v0 fails in its first step: LookupError: no wheels"),
+        (Paid, r"Mine-v0: the cost of a step must be a finite number ≥ 0, got -1.0"),
+        (Lost, r"Mine-v0: the cost of a step must be a finite number ≥ 0, got nan"),
+        (Free, r"Mine-v0: the cost of a step must be a finite number ≥ 0, got None"),
+        (Flat, r"Mine-v0 gives observation of shape \(1,\), its observation_space says \(2,\)"),
     ],
 )
+@pytest.mark.filterwarnings("ignore:.*not within the observation space")
 def test_an_environment_whose_episodes_cannot_be_judged_is_refused_at_once(kind, message, tmp_path, capsys):
     register_env("Mine-v0", kind, 20)
     with pytest.raises(ValueError, match=message.partition(" fails")[0]):
@@ -457,6 +514,22 @@ def test_an_environment_whose_episodes_cannot_be_judged_is_refused_at_once(kind,
     assert benchmark.main(arguments) == 2
     error = capsys.readouterr().err
     assert re.search(message, error) and error.count("\n") == 1
+
+
+class Undrawn(Judged):
+    def __init__(self):
+        super(Judged, self).__init__(dict_space=True)
+        self.observation_space = gym.spaces.Dict(
+            dict.fromkeys(OBSERVATIONS, gym.spaces.Box(-50, 50, (2,), float))
+        )
+
+    def _observe(self):
+        return dict.fromkeys(OBSERVATIONS, self.place)
+
+
+def test_an_environment_that_draws_nothing_needs_no_render_mode():
+    register_env("Mine-v0", Undrawn, 20)
+    assert len(play_episode(lambda observation: np.zeros(2), "Mine-v0", 3).action) == 7
 
 
 class Wrapped(gym.Wrapper):

@@ -134,7 +134,7 @@ def test_a_name_is_looked_up_by_its_file(shipped):
     shutil.copy(shipped / f"rise-{VEHICLE}.rise", shipped / f"rise-my-own-{VEHICLE}.rise")
     assert ("rise-my-own", VEHICLE) in pretrained.available()
     assert load_agent("rise-my-own", env=VEHICLE).name == "rise"
-    with pytest.raises(ValueError, match="name it with env="):
+    with pytest.raises(ValueError, match="name that, too"):
         load_agent("rise-my-own")
 
 
@@ -156,7 +156,7 @@ def test_what_is_missing_is_told_with_what_is_there(shipped, folder):
     for name, env in (("rise", PANDA), ("cppo", VEHICLE), ("risse", VEHICLE), ("rise", "nowhere")):
         with pytest.raises(ValueError, match=f"no weights of '{name}' for '{env}'.*{there}"):
             load_agent(name, env=env)
-    with pytest.raises(ValueError, match=f"name it with env=; {there}"):
+    with pytest.raises(ValueError, match=rf"name that, too \(env=, --env\); {there}"):
         load_agent("rise")
     shutil.rmtree(folder)
     with pytest.raises(ValueError, match="there are: none in this package"):

@@ -146,7 +146,7 @@ def posterior(answer: Any, offered: Estimates, scale: Any, memories: int) -> tup
         answer: the network's, (B, outputs).
         offered: the estimates.
         scale: of the noise at level 1 in each channel, (C,).
-        memories: L.
+        memories: how many: L.
     """
     xp = array_namespace(answer)
     start, means = 0, []

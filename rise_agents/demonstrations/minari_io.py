@@ -138,26 +138,25 @@ def _arrays(episodes: list[Any]) -> dict[str, Any]:
     def info(name: str, default: int) -> Any:
         return np.array([int(e.infos[name][0]) if name in (e.infos or {}) else default for e in episodes])
 
-    def costs(episode: Any) -> Any:
-        known = "cost" in (episode.infos or {})
-        return episode.infos["cost"][1:] if known else np.full(len(episode.actions), np.nan)
-
     if any("clean_observation" in (e.infos or {}) for e in episodes):
         raise DatasetError("its readings are noisy: record inside of the noise wrapper, not around it")
-    lengths = [len(e.actions) for e in episodes]
-    arrays: dict[str, Any] = {
-        "actions": np.concatenate([e.actions for e in episodes]).astype(np.float64),
-        "rewards": np.concatenate([e.rewards for e in episodes]).astype(np.float64),
-        "costs": np.concatenate([costs(e) for e in episodes]).astype(np.float64),
-        "offsets": np.concatenate(([0], np.cumsum(lengths))).astype(np.int64),
-        "seeds": info(_SEED, -1).astype(np.int64),
-        "expert": info(_EXPERT, 0).astype(np.int64),
-    }
     for key in OBSERVATIONS:
         if not all(isinstance(e.observations, dict) and key in e.observations for e in episodes):
             raise DatasetError(
                 f"observations have no {key!r}: they must be dicts of {', '.join(OBSERVATIONS)}"
             )
+    if any("cost" not in (e.infos or {}) for e in episodes):
+        raise DatasetError("its infos have no 'cost': record what every step cost, that of the reset being 0")
+    lengths = [len(e.actions) for e in episodes]
+    arrays: dict[str, Any] = {
+        "actions": np.concatenate([e.actions for e in episodes]).astype(np.float64),
+        "rewards": np.concatenate([e.rewards for e in episodes]).astype(np.float64),
+        "costs": np.concatenate([e.infos["cost"][1:] for e in episodes]).astype(np.float64),
+        "offsets": np.concatenate(([0], np.cumsum(lengths))).astype(np.int64),
+        "seeds": info(_SEED, -1).astype(np.int64),
+        "expert": info(_EXPERT, 0).astype(np.int64),
+    }
+    for key in OBSERVATIONS:
         arrays[f"observations.{key}"] = np.concatenate([e.observations[key][:-1] for e in episodes])
         arrays[f"final.{key}"] = np.stack([e.observations[key][-1] for e in episodes])
     return arrays

@@ -115,7 +115,7 @@ def generate(
     Args:
         env_id: a registered environment.
         expert: a name of :data:`rise_agents.experts.EXPERTS`.
-        episodes: E.
+        episodes: how many: E.
         seed: which range of training seeds to use.
         workers: processes; the result is the same for any number.
         finished: told how many episodes were kept and tried so far.

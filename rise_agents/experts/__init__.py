@@ -11,7 +11,7 @@ from rise_agents.agent import nearest
 from rise_envs import ENVS, STAND_INS
 from rise_envs.registry import Entry, check_new, checked_entry, checked_name, find_class
 from rise_envs.streams import checked_seed
-from rise_envs.task import task_of
+from rise_envs.task import describes_task, task_of
 
 EXPERTS: dict[tuple[str, str], str] = {
     ("RISE-GroundVehicle-v0", "cbf"): "rise_agents.experts.vehicle_cbf:VehicleCBF",
@@ -33,13 +33,15 @@ def register_expert(env_id: str, name: str, entry: Entry) -> None:
         entry: its class (or ``"module:Class"``), made as ``Class(task, seed=0)``, which has a ``predict``.
 
     Raises:
-        ValueError: a name that is malformed or taken, an environment that is not registered, or a class without
-            ``predict``.
+        ValueError: a name that is malformed or taken, an environment that is not registered or describes no task,
+            or a class without ``predict``.
     """
     kind = f"expert {checked_name('an expert', name)!r} for {env_id}"
     if env_id not in ENVS or env_id in STAND_INS:
         known = [env for env in ENVS if env not in STAND_INS]
         raise ValueError(f"{kind}: no such environment, or a stand-in for one; {nearest(env_id, known)}")
+    if not describes_task(env_id):
+        raise ValueError(f"{kind}: the environment describes no task; give its class a static method task()")
     text = checked_entry(kind, entry, ("predict",))[1]
     check_new(kind, EXPERTS.get((env_id, name)), text)
     EXPERTS[env_id, name] = text

@@ -42,7 +42,7 @@ def find(agent: str, env: str | None) -> Path:
     there = ", ".join(f"{name} for {task}" for name, task in available()) or "none in this package"
     if env is None:
         raise ValueError(
-            f"weights of {agent!r} are for an environment: name it with env=; there are: {there}"
+            f"weights of {agent!r} are for an environment: name that, too (env=, --env); there are: {there}"
         )
     if (agent, env) not in available():
         raise ValueError(f"no weights of {agent!r} for {env!r} come with this package; there are: {there}")
