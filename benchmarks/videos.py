@@ -88,7 +88,7 @@ def strip(clip: Clip, count: int = KEY_FRAMES) -> Frame:
     for n, pick in enumerate(picks):
         last, words = n == count - 1, ""
         if pick == clip.closest:
-            words = f"least, within the step: {clip.clearance:.2f} m".replace("-", "−")
+            words = f"least, within the step: {clip.clearance:.2f} m"
         words = clip.ended or clip.outcome if last else words
         cell = Image.fromarray(
             caption(clip.frames[pick], f"t = {clip.times[pick]:.2f} s", words, _COLOURS[clip.outcome])

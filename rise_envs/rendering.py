@@ -245,7 +245,7 @@ def _draw_strip(canvas: Canvas, time: float, clearance: float, as_read: bool) ->
     pygame.draw.line(canvas.surface, BORDER, (0, SIZE * s), (SIZE * s, SIZE * s), s)
     _write(canvas, f"{time:.1f} s", 14 * s, INK)
     text = f"clearance {clearance:.2f} m" if clearance >= 0 else f"collision {clearance:.2f} m"
-    _write(canvas, text.replace("-", "−"), 74 * s, INK if clearance >= 0 else WARNING)
+    _write(canvas, text, 74 * s, INK if clearance >= 0 else WARNING)
     legend = [(216, "start"), (284, "goal"), (348, "obstacle, true")]
     for x, name in [*legend, (477, "obstacle, as read")] if as_read else legend:
         _draw_symbol(canvas, canvas.point(x * s, (SIZE + STRIP / 2) * s), name)

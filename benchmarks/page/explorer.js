@@ -162,7 +162,7 @@ class Explorer {
       const canvas = document.createElement("canvas"), caption = document.createElement("figcaption");
       const name = document.createElement("strong"), ended = document.createElement("span");
       name.textContent = agent.label;
-      name.style.borderColor = agent.colour;
+      name.style.borderColor = seen(agent.colour);
       ended.textContent = `${outcome(episode)}, ${episode.steps} steps`;
       ended.className = kind(episode);
       caption.append(name, ended);

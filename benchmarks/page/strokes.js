@@ -9,10 +9,12 @@ const cross3 = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], 
 
 const dark = matchMedia("(prefers-color-scheme: dark)");
 
-// A colour "#rrggbb" that is seen on the page: on a dark one nearer to white, as those of agents are made for a light one.
+// A colour "#rrggbb" that is seen on the page: on a dark one those that are dark themselves are mixed with white.
 function seen(paint) {
   if (!dark.matches || !/^#[0-9a-f]{6}$/i.test(paint ?? "")) return paint;
-  return `#${[1, 3, 5].map((i) => Math.round(0.6 * parseInt(paint.slice(i, i + 2), 16) + 0.4 * 255).toString(16).padStart(2, "0")).join("")}`;
+  const parts = [1, 3, 5].map((i) => parseInt(paint.slice(i, i + 2), 16) / 255);
+  const light = dot(parts, [0.3, 0.6, 0.1]), white = Math.max(0, (0.55 - light) / (1 - light));
+  return `rgb(${parts.map((part) => Math.round(255 * (part + white * (1 - part)))).join(" ")})`;
 }
 
 function line(c, a, b) {
