@@ -416,13 +416,13 @@ def agent(vehicle_demonstrations):
     return make_agent("rise", VEHICLE, {"updates": 40, "vae_updates": 40}).learn(vehicle_demonstrations)
 
 
-def controlled(policy, env_id=VEHICLE, periods=60, level=1.0, seed=5):
-    clock, task = Told(), task_of(env_id)
+def controlled(policy, env_id=VEHICLE, periods=60, level=1.0, seed=5, clock=None, rules=None):
+    clock, task = clock or Told(), task_of(env_id)
     robot = EnvRobot(env_id, clock, seed)
     stream = NoisyStream(RobotReadings(robot), task, "step", level, seed)
     env = gym.make(env_id)
     limits = Limits(env.action_space.low.astype(float), env.action_space.high.astype(float))
-    loop = ControlLoop(Mind(policy, seed), robot, stream, task, limits, task.dt, clock=clock)
+    loop = ControlLoop(Mind(policy, seed), robot, stream, task, limits, task.dt, rules, clock)
     loop.recorder.about |= {"period": task.dt, "seed": seed, "deterministic": loop.mind.deterministic}
     loop.run(periods * task.dt)
     robot.close()
@@ -470,6 +470,49 @@ def test_a_run_can_be_decided_again(agent, vehicle_demonstrations):
     assert decide_again(found, agent) == 0.0
     found.about["seed"] = 6
     assert decide_again(found, agent) > 1e-3
+
+
+class Slow:
+    """Another policy, some of whose decisions take too long, or are none."""
+
+    def __init__(self, policy, clock, slow=(), spoilt=()):
+        self.policy, self.clock, self.slow, self.spoilt, self.calls = policy, clock, slow, spoilt, 0
+        self.initial_state, self.evaluate_deterministic = policy.initial_state, policy.evaluate_deterministic
+
+    def predict(self, *arguments):
+        wanted, state = self.policy.predict(*arguments)
+        self.calls += 1
+        if self.calls in self.slow:
+            self.clock.work(0.25)
+        return (wanted * np.nan if self.calls in self.spoilt else wanted), state
+
+
+@pytest.mark.parametrize(("name", "first"), [("rise", 1), ("rise", 7), ("rise-belief", 7)])
+def test_a_run_with_decisions_that_were_discarded_can_be_decided_again(
+    vehicle_demonstrations, agent, name, first
+):
+    """What nobody acted on has drawn nothing, and nothing of it is remembered; the same of an episode's first one."""
+    if name == "rise-belief":
+        briefly = {"updates": 10, "belief_updates": 10, "belief_batch_size": 64, "belief_rows": 1_000}
+        agent = make_agent(name, VEHICLE, briefly).learn(vehicle_demonstrations)
+    clock = Told()
+    slow = Slow(agent, clock, slow=(first, 20))
+    found = controlled(slow, clock=clock, rules=Rules(resume_after=0.0))
+    assert sum("stop: stale" in event for event in found.events) == 2
+    assert np.isfinite(found.vectors["wanted"]).all(1).sum() == slow.calls - 2 > 40
+    assert decide_again(found, agent) == 0.0
+
+
+def test_a_decision_that_is_none_changes_nothing_that_is_remembered(agent):
+    clock = Told()
+    spoilt = Slow(agent, clock, spoilt=(7,))
+    mind, seen = Mind(spoilt, 5), {key: np.ones(shape) for key, shape in TASK.shapes.items()}
+    wants = [mind.decide(seen, False) for _ in range(7)]
+    mind.discard()
+    wants[6] = mind.decide(seen, False)
+    assert mind.deterministic is False
+    again = Mind(agent, 5)
+    np.testing.assert_array_equal(wants, [again.decide(seen, False) for _ in range(7)])
 
 
 def test_noise_is_drawn_once_for_a_reading():

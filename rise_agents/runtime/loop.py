@@ -59,6 +59,10 @@ class Monotonic:
 class Mind:
     """A policy with what it remembers of the episode.
 
+    What counts is what was acted on: a decision that nobody acts on leaves no trace, so that what comes after it can be
+    decided again from a log, which does not hold it. A belief loses no reading by that: whoever discards a decision
+    stops, and a policy that goes on after a stop begins anew.
+
     Args:
         policy: an agent, an expert, an exported agent.
         seed: of what it draws.
@@ -70,13 +74,19 @@ class Mind:
         judged = bool(getattr(policy, "evaluate_deterministic", True))
         self.deterministic = judged if deterministic is None else deterministic
         self._state: Any = initial_state(policy, policy_keys([seed]))
+        self._before = self._state
 
     def decide(self, observation: dict[str, NDArray], begins: bool) -> Any:
         """What the policy wants, (A,)."""
+        self._before = self._state
         wanted, self._state = self.policy.predict(
             observation, self._state, np.array([begins]), self.deterministic
         )
         return wanted
+
+    def discard(self) -> None:
+        """Be as before the last decision."""
+        self._state = self._before
 
 
 class ControlLoop:
@@ -204,7 +214,10 @@ class ControlLoop:
         self._fresh = False
         # What took long was decided on a reading that may be too old by now.
         why = self.limits.check(wanted) or self.watchdog.judge(reading, self.clock.now())
-        return (None, why) if why else (wanted, None)
+        if why is not None:
+            self.mind.discard()
+            return None, why
+        return wanted, None
 
     def _command(self, wanted: NDArray | None, events: list[str]) -> NDArray[np.float32]:
         """Tell the robot what to do; the action that stands."""

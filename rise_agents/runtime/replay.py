@@ -38,6 +38,9 @@ def parser() -> Parser:
 def decide_again(found: log.Log, policy: Any) -> float:
     """Largest difference between what ``policy`` wants on the recorded observations and what was wanted then.
 
+    Decisions that were discarded are not in a log; they changed nothing that the policy remembers
+    (:class:`rise_agents.runtime.loop.Mind`).
+
     Raises:
         ValueError: a policy that cannot read them, or nothing was decided.
     """
