@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import gc
+import os
 import signal
+import sys
 from dataclasses import replace
 
 import gymnasium as gym
@@ -694,6 +696,24 @@ def test_a_log_is_kept_though_a_signal_comes_while_it_is_written(agent, tmp_path
     assert code == (130 if first else 0) and told[-1] == "stop"
     assert len(log.read(tmp_path / "run.parquet")) == (0 if first else 2)
     assert handlers == [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)]
+
+
+def test_signals_that_come_at_once_end_a_run_quietly(agent, tmp_path, capsys, monkeypatch):
+    """Both are there before Python handles the first: nothing is raised where nobody can catch it."""
+    both, complaints = (signal.SIGTERM, signal.SIGINT), []
+
+    def observe(self):
+        signal.pthread_sigmask(signal.SIG_BLOCK, both)
+        for number in both:
+            os.kill(os.getpid(), number)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, both)
+        return Observed(np.zeros(3), np.zeros(2))
+
+    monkeypatch.setattr(EnvRobot, "observe", observe)
+    monkeypatch.setattr(sys, "unraisablehook", complaints.append)
+    agent.save(tmp_path / "agent.rise")
+    assert main(["--agent", str(tmp_path / "agent.rise"), "--env", VEHICLE, "--seconds", "0.2"]) == 130
+    assert not complaints and not capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -109,12 +109,16 @@ def _handle(how: Any) -> list[Any]:
     return [signal.signal(number, how) for number in _POLITE]
 
 
+def _ignore(*_: Any) -> None:
+    """Nothing; with ``SIG_IGN`` in its place Python complains of a signal that came before, but was not handled yet."""
+
+
 @contextmanager
 def _interrupted_once() -> Iterator[None]:
     """Ctrl-C and a polite kill end the run; another one cuts short neither the robot's stop nor the log."""
 
     def interrupt(*_: Any) -> None:
-        _handle(signal.SIG_IGN)
+        _handle(_ignore)
         raise KeyboardInterrupt
 
     before = _handle(interrupt)
@@ -155,7 +159,7 @@ def _run(loop: ControlLoop, a: Any, udp: UdpStream | None) -> int:
     code = 0
     try:
         loop.run(a.seconds)
-        _handle(signal.SIG_IGN)
+        _handle(_ignore)
     except KeyboardInterrupt:
         code = 130
     found = loop.recorder.log()
