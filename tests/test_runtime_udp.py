@@ -353,7 +353,6 @@ def test_real_time_on_an_idle_core():
     try:
         until(lambda: stream.latest() is not None, 60.0)
         loop = ControlLoop(Mind(Policy()), robot, stream, TASK, limits, period, clock=clock)
-        loop.recorder.about["period"] = period
         loop.run(64.0)
     finally:
         sender.kill()

@@ -70,7 +70,7 @@ class Mind:
     """
 
     def __init__(self, policy: Any, seed: int = 0, deterministic: bool | None = None) -> None:
-        self.policy = policy
+        self.policy, self.seed = policy, seed
         judged = bool(getattr(policy, "evaluate_deterministic", True))
         self.deterministic = judged if deterministic is None else deterministic
         self._state: Any = initial_state(policy, policy_keys([seed]))
@@ -101,7 +101,8 @@ class ControlLoop:
         period: (s).
         rules: of stopping.
         clock: to keep time by.
-        recorder: is told everything.
+        recorder: is told everything; None: one whose log can be summed up and, if the policy is an
+            agent or an exported one, decided again.
     """
 
     def __init__(
@@ -118,7 +119,9 @@ class ControlLoop:
     ) -> None:
         self.mind, self.robot, self.stream, self.limits = mind, robot, stream, limits
         self.period, self.clock = period, Monotonic() if clock is None else clock
-        self.recorder = Recorder(task, len(limits.low)) if recorder is None else recorder
+        self.recorder = (
+            Recorder(task, len(limits.low), _about(mind, period)) if recorder is None else recorder
+        )
         self.watchdog = Watchdog(Rules() if rules is None else rules, period, task.widths["obstacle"])
         self._last, self._fresh = limits.rest(), True
         self._fatal = False
@@ -266,6 +269,13 @@ def _steady() -> Iterator[None]:
     finally:
         if was:
             gc.enable()
+
+
+def _about(mind: Mind, period: float) -> dict[str, Any]:
+    """What is known of a run, as numbers and texts that JSON has."""
+    about = {"period": float(period), "seed": int(mind.seed), "deterministic": bool(mind.deterministic)}
+    env_id = getattr(mind.policy, "env_id", None)  # of agents, exported or not
+    return about if env_id is None else about | {"env": str(env_id)}
 
 
 def _line(error: Exception) -> str:

@@ -64,7 +64,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     a: Any = parser().parse_args(argv)
     try:
         found = log.read(a.log)
-        print(f"{a.log}: {found.about.get('agent')} in {found.about.get('env')}")
+        print(
+            f"{a.log}: {found.about.get('agent', 'a policy')} in {found.about.get('env', 'a task of its own')}"
+        )
         print(text(summarise(found)))
         for t, event in enumerate(found.events):
             if event:
