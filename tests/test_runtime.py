@@ -202,15 +202,15 @@ def test_a_state_that_is_not_finite():
 
 
 class Odd(Readings):
-    """Readings one of which is odd."""
+    """Readings some of which are odd: the fourth, if nothing else is said."""
 
     def __init__(self, clock, odd):
         super().__init__(clock, regular(clock))
-        self.odd = odd
+        self.odd, self.odd_ones = odd, (4,)
 
     def latest(self):
         reading = super().latest()
-        return self.odd(reading) if reading.number == 4 else reading
+        return self.odd(reading) if reading.number in self.odd_ones else reading
 
 
 def no_answer(reading):
@@ -234,6 +234,31 @@ def test_streams_that_go_wrong_stop_the_robot_for_good(odd, says):
     loop.run(8 * T)
     assert str(loop.watchdog.stopped).startswith(says) and len(robot.times("apply")) == 3
     assert any(says in event for event in loop.recorder.log().events)
+
+
+@pytest.mark.parametrize(
+    ("odd", "says"),
+    [
+        (lambda reading: replace(reading, obstacle=np.zeros(3)), "reading: has shape (3,), not (5,)"),
+        (lambda reading: replace(reading, stamp=reading.stamp + 100.0), "reading: is stamped 164.0"),
+        (lambda reading: replace(reading, stamp=reading.stamp - 100.0), "stale: the last reading is 800.00"),
+        (no_answer, "reading: OSError: no answer"),
+    ],
+)
+@pytest.mark.parametrize("ends", [1, 5, 99])
+def test_why_nothing_moves_from_the_beginning_is_told_once_and_no_reason_not_to_begin(odd, says, ends):
+    """The first reading is good, or comes after bad ones, or never."""
+    clock = Clock()
+    robot, readings = Robot(clock), Odd(clock, odd)
+    readings.odd_ones = range(1, ends)
+    loop = make(clock, robot=robot, readings=readings)
+    loop.run(8 * T)
+    found = loop.recorder.log()
+    stops = summarise(found).stops
+    assert len(stops) == (ends > 1) and len(robot.times("apply")) == max(0, 9 - ends)
+    if stops:
+        assert stops[0].startswith(f"waiting: no good reading yet ({says}") and stops[0] in found.events[0]
+    assert str(loop.watchdog.stopped) == (stops[0] if ends == 99 else "None")
 
 
 def test_nobody_acts_on_what_has_become_stale_while_it_was_decided():

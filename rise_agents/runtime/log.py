@@ -95,6 +95,7 @@ class Recorder:
         self.about = dict(about or {})
         self._rows: list[tuple[Any, ...]] = []
         self._events: list[str] = []
+        self._before: list[str] = []  # events before the first row
 
     def add(
         self,
@@ -123,11 +124,14 @@ class Recorder:
                 ),
             )
         )
-        self._events.append("; ".join(event.replace("; ", ", ") for event in events))
+        self._events.append("; ".join(event.replace("; ", ", ") for event in (*self._before, *events)))
+        self._before.clear()
 
     def amend(self, event: str) -> None:
-        """Add an event to the last period."""
-        if self._events:
+        """Add an event to the last period; before the first one, to that."""
+        if not self._events:
+            self._before.append(event)
+        else:
             self._events[-1] = "; ".join(filter(None, (self._events[-1], event.replace("; ", ", "))))
 
     def log(self) -> Log:

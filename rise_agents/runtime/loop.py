@@ -239,10 +239,10 @@ class ControlLoop:
         return action
 
     def _stop(self, why: Stop) -> bool:
-        """Stop the robot; whether it went before."""
-        went = self.watchdog.stop(why)
+        """Stop the robot; whether there is a reason to tell."""
+        told = self.watchdog.stop(why)
         self._halt()
-        return went
+        return told
 
     def _halt(self) -> None:
         self._last = self.limits.rest()

@@ -60,6 +60,9 @@ class Stop:
         return f"{self.kind}: {self.words}"
 
 
+_NO_READING = Stop(WAITING, "no reading yet")
+
+
 class Watchdog:
     """The state of a run: going, or stopped for a reason.
 
@@ -71,7 +74,7 @@ class Watchdog:
 
     def __init__(self, rules: Rules, period: float, channels: int) -> None:
         self.rules, self.period, self.channels = rules, period, channels
-        self.stopped: Stop | None = Stop(WAITING, "no reading yet")
+        self.stopped: Stop | None = _NO_READING
         self._late = 0  # periods in a row
         self._good_since: float | None = None
         self._restart = False
@@ -83,7 +86,7 @@ class Watchdog:
     def judge(self, reading: Reading | None, now: float) -> Stop | None:
         """What is wrong with the latest reading."""
         if reading is None:
-            return Stop(WAITING, "no reading yet")
+            return _NO_READING
         if not reading.stamp <= now + self.period:  # NaN is no time either
             return Stop("reading", f"is stamped {reading.stamp}, now it is {now}")
         if now >= self.stale_at(reading):
@@ -103,16 +106,22 @@ class Watchdog:
         return None
 
     def stop(self, why: Stop) -> bool:
-        """Stop; whether it went before. The first reason stays, but for a robot that fails."""
+        """Stop; whether there is a reason to tell. The first one stays, but for a robot that fails.
+
+        A run waits for its first good reading. The first bad one before it is a reason, but does not end the waiting.
+        """
         went = self.stopped is None
+        bad = self.stopped == _NO_READING and why.kind in {"reading", "stale"}
+        if bad:
+            why = Stop(WAITING, f"no good reading yet ({why})")
         if went and why.kind == WAITING:  # there was one
             why = Stop("stale", "no reading any more")
         if went:
             self._restart = False  # who said so before knew nothing of this
-        if went or why.kind == "robot":
+        if went or bad or why.kind == "robot":
             self.stopped = why
         self._good_since = None
-        return went
+        return went or bad
 
     def restart(self) -> None:
         """Go on with the next good reading, whatever the reason was; one that goes is not changed."""
