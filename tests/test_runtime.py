@@ -301,7 +301,16 @@ def test_an_interruption_stops_the_robot_and_keeps_what_happened():
     loop = make(clock, Policy(*[(1.0, 0.5)] * 5, interrupt), robot)
     with pytest.raises(KeyboardInterrupt):
         loop.run(100 * T)
-    assert robot.told[-1][1] == "stop" and len(loop.recorder.log()) == 5 and gc.isenabled()
+    found = loop.recorder.log()
+    assert robot.told[-1][1] == "stop" and len(found) == 5 and gc.isenabled()
+    assert found.events == ["go", "", "", "", "interrupted"] and not summarise(found).stops
+
+
+def test_the_planned_end_is_logged_and_no_stop_of_a_watchdog():
+    loop = make(Clock())
+    loop.run(3 * T)
+    found = loop.recorder.log()
+    assert found.events == ["go", "", "end"] and not summarise(found).stops
 
 
 @pytest.mark.parametrize(

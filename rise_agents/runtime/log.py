@@ -60,7 +60,8 @@ class Log:
         flags: ``reached``, ``begins`` (an episode), ``fresh`` (the policy began anew), (T,) each.
         vectors: ``state`` (T, S), ``goal`` (T, D), ``reading`` (T, C), ``wanted`` by the policy (T, A) and the
             ``action`` after limits (T, A); NaN: there was none.
-        events: words, (T,), parted by ``; ``.
+        events: words, (T,), parted by ``; ``: ``go``, ``overrun``, ``stop: `` and why, and in the last row how the run
+            ended, ``end`` or ``interrupted``, which is no stop by a watchdog.
     """
 
     about: dict[str, Any]

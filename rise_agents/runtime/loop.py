@@ -131,12 +131,12 @@ class ControlLoop:
         self.watchdog.restart()
 
     def run(self, seconds: float) -> None:
-        """Control for so long, or until the robot fails. However it ends, the robot is told to stop.
+        """Control for so long, or until the robot fails. However it ends, the robot is told to stop, and the log how.
 
         Raises:
             KeyboardInterrupt: as it came, after the robot has been stopped.
         """
-        periods = max(1, round(seconds / self.period))
+        periods, how = max(1, round(seconds / self.period)), "interrupted"
         with _steady():
             start, k = self.clock.now(), 0
             try:
@@ -148,8 +148,10 @@ class ControlLoop:
                     k = max(k + 1, passed)
                 if not self._fatal:
                     self._rest_until(start + periods * self.period)
+                how = "end"
             finally:
                 self._halt()
+                self.recorder.amend(how)
 
     def _rest_until(self, deadline: float) -> None:
         """Wait for the next period; stop the robot at the moment that its last reading becomes stale."""
