@@ -213,6 +213,9 @@ class Odd(Readings):
         return self.odd(reading) if reading.number in self.odd_ones else reading
 
 
+READING, NUMBERS = "reading: TypeError: latest() must return Reading whose", "an array of numbers"
+
+
 def no_answer(reading):
     raise OSError("no answer")
 
@@ -225,6 +228,14 @@ def no_answer(reading):
         (lambda reading: replace(reading, stamp=-1e9), "stale: the last reading is"),
         (lambda reading: None, "stale: no reading any more"),
         (no_answer, "reading: OSError: no answer"),
+        (lambda reading: C, "reading: TypeError: latest() must return Reading, got ndarray"),
+        (lambda reading: replace(reading, obstacle=C.tolist()), f"{READING} obstacle is {NUMBERS}, got list"),
+        (
+            lambda reading: replace(reading, obstacle=C.astype("O")),
+            f"{READING} obstacle is {NUMBERS}, got object",
+        ),
+        (lambda reading: replace(reading, goal=[9.0, 0.0]), f"{READING} goal is {NUMBERS}, got list"),
+        (lambda reading: replace(reading, stamp=None), f"{READING} stamp is a number, got None"),
     ],
 )
 def test_streams_that_go_wrong_stop_the_robot_for_good(odd, says):
@@ -277,6 +288,26 @@ def test_a_robot_that_fails_ends_the_run_and_is_told_to_stop(fails):
     loop.run(10 * T)
     assert loop.watchdog.stopped.kind == "robot" and clock.time < 64.0 + 2 * T
     assert robot.told[-1][1] == "stop" and not robot.times("apply")
+
+
+@pytest.mark.parametrize(
+    ("observed", "says"),
+    [
+        (None, "must return Observed, got NoneType"),
+        (np.zeros(3), "must return Observed, got ndarray"),
+        (Observed([0.0, 0.0, 0.0], np.zeros(2)), f"must return Observed whose state is {NUMBERS}, got list"),
+        (Observed(np.zeros(3), None), f"must return Observed whose goal is {NUMBERS}, got NoneType"),
+    ],
+)
+def test_a_robot_that_returns_something_else_ends_the_run_and_is_told_to_stop(observed, says):
+    clock = Clock()
+    robot = Robot(clock)
+    loop = make(clock, robot=robot)
+    clock.at = [(clock.time + 2.5 * T, lambda: setattr(robot, "observe", lambda: observed))]
+    loop.run(8 * T)
+    assert str(loop.watchdog.stopped) == f"robot: TypeError: observe() {says}"
+    assert robot.told[-1][1] == "stop" and len(robot.times("apply")) == 3
+    assert loop.recorder.log().events == ["go", "", f"stop: {loop.watchdog.stopped}; end"]
 
 
 def test_a_robot_that_cannot_be_told_to_stop_ends_the_run_with_a_log():

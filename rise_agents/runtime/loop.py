@@ -21,7 +21,7 @@ from rise_agents.agent import initial_state
 from rise_agents.rollout import policy_keys
 from rise_agents.runtime.log import Recorder, Times
 from rise_agents.runtime.robots import Observed, Robot
-from rise_agents.runtime.streams import Reading, ReadingStream
+from rise_agents.runtime.streams import Reading, ReadingStream, checked, require_returned
 from rise_agents.runtime.watchdog import Limits, Rules, Stop, Watchdog
 from rise_envs.task import Task
 
@@ -171,12 +171,13 @@ class ControlLoop:
         begun, events = self.clock.now(), []
         try:
             observed = self.robot.observe()
+            require_returned("observe()", observed, Observed, "state", "goal")
         except Exception as error:  # whatever a driver raises: there is nothing to act on
             self._fatal = True
             self._note_stop(Stop("robot", _line(error)))
             return
         reading, now = self._read(), self.clock.now()
-        self._fresh |= observed.begins
+        self._fresh |= bool(observed.begins)
         wanted = None
         why = self.watchdog.judge(reading, now)
         if why is None and self.watchdog.resumes(now):
@@ -201,7 +202,7 @@ class ControlLoop:
 
     def _read(self) -> Reading | None:
         try:
-            return self.stream.latest()
+            return checked(self.stream.latest())
         except Exception as error:  # whatever a sensor's driver raises: it is as good as no reading
             self._note_stop(Stop("reading", _line(error)))
             return None

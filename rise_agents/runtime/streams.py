@@ -6,6 +6,7 @@ Shapes: C reading channels, D dimensions of a goal.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from numbers import Real
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -38,6 +39,30 @@ class Reading:
     number: int
     goal: Array | None = None
     begins: bool = False
+
+
+def require_returned(call: str, value: Any, kind: type, *arrays: str) -> None:
+    """Raise a ``TypeError`` that says what a driver returned, if it is no ``kind`` with these arrays of numbers."""
+    if not isinstance(value, kind):
+        raise TypeError(f"{call} must return {kind.__name__}, got {type(value).__name__}")
+    for name in arrays:
+        part = getattr(value, name)
+        if not (isinstance(part, np.ndarray) and part.dtype.kind in "fiu"):
+            got = part.dtype if isinstance(part, np.ndarray) else type(part).__name__
+            raise TypeError(
+                f"{call} must return {kind.__name__} whose {name} is an array of numbers, got {got}"
+            )
+
+
+def checked(reading: Reading | None) -> Reading | None:
+    """What a stream returned; raises a ``TypeError`` if its kind is wrong. Its values are the watchdog's matter."""
+    if reading is not None:
+        require_returned("latest()", reading, Reading, "obstacle")
+        if reading.goal is not None:
+            require_returned("latest()", reading, Reading, "goal")
+        if not isinstance(reading.stamp, Real):
+            raise TypeError(f"latest() must return Reading whose stamp is a number, got {reading.stamp!r}")
+    return reading
 
 
 class ReadingStream(Protocol):
