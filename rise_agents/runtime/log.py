@@ -80,7 +80,7 @@ class Recorder:
 
     Args:
         task: gives the widths of states, goals and readings.
-        actions: A.
+        actions: how many: A.
         about: what is run, fit for JSON.
     """
 
