@@ -39,6 +39,8 @@ def run(work: Callable[[int, int], T], rows: int, threads: int, piece: int) -> l
         return [work(first, min(first + piece, rows)) for first in begins]
 
     helpers = min(threads, -(-rows // piece)) - 1
+    if not helpers:  # to wait for nobody takes time, too
+        return share()
     others = [_pool(threads).submit(share) for _ in range(helpers)]
     try:
         own = share()
