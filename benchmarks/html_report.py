@@ -21,7 +21,7 @@ from typing import Any
 from jinja2 import Environment, StrictUndefined
 from markdown_it import MarkdownIt
 
-from benchmarks import charts, explorer, plots, report
+from benchmarks import charts, explorer, plots, report, results
 from benchmarks.charts import Chart
 from benchmarks.labels import (
     agent_label,
@@ -199,22 +199,12 @@ def _trainings(
                 record = folder / Path(path).with_suffix(".json")
                 if split_row(row)[0] == base and path not in seen and record.is_file():
                     seen.add(path)
-                    curves[f"seed {seed}"] = curve(record)
+                    curves[f"seed {seed}"] = results.curve(record)
             chart = charts.training(
                 f"{agent_label(base)} on {env_label(env)}", curves, plots.colour(list(bases), base)
             )
             found += [(f"training-{env}-{base}", chart)] if chart else []
     return found
-
-
-def curve(path: Path) -> list[dict[str, float]]:
-    """The figures of progress of one training; raises ``ValueError`` if it is no such record."""
-    try:
-        return [
-            {str(k): float(v) for k, v in point.items()} for point in json.loads(path.read_bytes())["curve"]
-        ]
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
-        raise ValueError(f"{path} is not the record of a training ({error})") from None
 
 
 def _selection(tasks: Sequence[Mapping[str, Any]]) -> str:

@@ -15,7 +15,6 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks import plots
 from benchmarks.labels import (
     agent_label,
     condition_label,
@@ -334,6 +333,8 @@ def publish(rows: pa.Table, run: Mapping[str, Any], out: Path) -> list[SummaryRo
 
 def _draw(summary: Sequence[SummaryRow], out: Path) -> dict[str, str]:
     """The figures of the rows that were asked for; path → caption."""
+    from benchmarks import plots  # half a second, which only those who draw need wait for
+
     figures: dict[str, str] = {}
     models = sorted({row.noise_model for row in summary}, key=model_order)
     for model in models:
@@ -355,6 +356,8 @@ def others_figure(env: str) -> str:
 
 def _draw_others(others: Sequence[Section], out: Path) -> dict[str, str]:
     """A figure per task of what was measured beside these; path → caption."""
+    from benchmarks import plots
+
     figures: dict[str, str] = {}
     for env in dict.fromkeys(row.env for section in others for row in section.rows):
         of_env = [Section(s.title, [row for row in s.rows if row.env == env]) for s in others]

@@ -7,6 +7,7 @@ whole or not at all.
 from __future__ import annotations
 
 import io
+import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -176,6 +177,16 @@ def read_rows(path: StrPath) -> pa.Table:
             f"{path}: cannot be read as results ({error}); remove it to compute it again"
         ) from None
     return check(table, str(path))
+
+
+def curve(path: Path) -> list[dict[str, float]]:
+    """The figures of progress of one training; raises ``ValueError`` if it is no such record."""
+    try:
+        return [
+            {str(k): float(v) for k, v in point.items()} for point in json.loads(path.read_bytes())["curve"]
+        ]
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+        raise ValueError(f"{path} is not the record of a training ({error})") from None
 
 
 def sort_rows(rows: pa.Table, keys: Sequence[str]) -> pa.Table:

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import report, results
-from benchmarks.html_report import curve
 from benchmarks.labels import count, split_row
 from rise_agents.cli import Parser, WorkFailed, command
 
@@ -79,7 +78,9 @@ def _tracked(
     row, _, seed = keys[0].rpartition("-seed")
     base = split_row(row)[0]
     config = {"env": env, "agent": base, "seed": int(seed), **training.get(base, {}).get(env, {})}
-    points = [(_step(point), {k: v for k, v in point.items() if k != "share"}) for point in curve(record)]
+    points = [
+        (_step(point), {k: v for k, v in point.items() if k != "share"}) for point in results.curve(record)
+    ]
     summary = {
         name: rate
         for key in keys

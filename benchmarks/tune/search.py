@@ -6,22 +6,23 @@ import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from benchmarks.display import Display
 from benchmarks.executors import Failure, MakeCrew, run_jobs
 from benchmarks.jobs import Job, demonstrations_folder, recording_jobs, tidy, wanted, with_events
 from benchmarks.labels import count, name_rows
-from benchmarks.plots import save_png
 from benchmarks.protocol import Plan, imitates
 from benchmarks.tune import known, report
-from benchmarks.tune.figure import Marks, figure
 from benchmarks.tune.ranking import Rates, best_clean, finalists, mean, ranked
 from benchmarks.tune.studies import Study, condition, drawn_trials, judge
 from rise_agents import demonstrations
 from rise_agents.files import sweep
 from rise_agents.pool import Pool
 from rise_envs import STAND_INS
+
+if TYPE_CHECKING:
+    from benchmarks.tune.figure import Marks
 
 
 @dataclass(frozen=True)
@@ -176,6 +177,9 @@ def execute(search: Search, sets: Mapping[str, tuple[Path, str]], out: Path, how
             found.append(report.Found(study, *numbers))
     report.write_trials(out / "trials.csv", studies, len(seeds), out)
     if best:
+        from benchmarks.plots import save_png  # who only asks for help need not wait for what draws
+        from benchmarks.tune.figure import figure
+
         winners = {(each.study.row, each.study.env): each.chosen for each in found}
         save_png(figure(_marks(studies, seeds, out), winners, search.clean_loss, best), out / "search.png")
     tables = report.tables(found, how.command, search.clean_loss)
