@@ -188,7 +188,7 @@ def estimate(a: Any) -> str:
     costs = {nodes: simulate(jobs, seconds, nodes * a.cores) for nodes in a.nodes}
     path = simulate(jobs, seconds, len(jobs)).wall
     lines.append(
-        f"The longest chain of jobs that wait for each other takes {path / 3600:.2f} h: no cluster is faster."
+        f"The longest chain of counted jobs that wait for each other takes {path / 3600:.2f} h: no cluster is faster."
     )
     return "\n".join([*lines, "", table(costs, a.cores, a.price)])
 

@@ -19,7 +19,7 @@ class Summary:
     Attributes:
         periods: that were run.
         missed: that were left out, since others took too long.
-        error_p50: median of |duration / period − 1| over periods.
+        error_p50: median over periods of how far duration / period is from 1.
         error_p99: its 99th percentile.
         on_time: share of periods within 10 % of the nominal one.
         work_p99: 99th percentile of the time from the beginning of a period until its command (s).
