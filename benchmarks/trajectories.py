@@ -102,9 +102,8 @@ def play(
     """
     if watch is not None and not draws(env_id):
         raise ValueError(f"{env_id} draws no pictures")
-    how: dict[str, Any] = (
-        {} if watch is None else {"render_mode": "rgb_array"}
-    )  # which not every environment knows
+    # Not every environment knows the argument.
+    how: dict[str, Any] = {} if watch is None else {"render_mode": "rgb_array"}
     env: gym.Env = gym.make(env_id, **how)
     options = None
     if noise_level > 0:

@@ -48,10 +48,9 @@ def film(act: Act, env_id: str, seed: int, noise_model: str, noise_level: float)
     frames: list[Frame] = []
     episode = play(act, env_id, seed, noise_model, noise_level, watch=lambda env: frames.append(_frame(env)))
     times = [i * step_seconds(env_id) for i in range(len(frames))]
-    ended, least = outcome(episode), episode.outcomes["min_clearance"]
-    if ended == "collision":
-        ended += ", goal reached" if episode.arrived else ", goal not reached"
-    return Clip(frames, times, outcome(episode), episode.closest, least, ended)
+    word, least = outcome(episode), episode.outcomes["min_clearance"]
+    goal = ", goal reached" if episode.arrived else ", goal not reached"
+    return Clip(frames, times, word, episode.closest, least, word + goal * (word == "collision"))
 
 
 def outcome(episode: Trajectory) -> str:

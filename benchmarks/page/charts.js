@@ -58,5 +58,5 @@ async function startCharts(charts) {
     draw(box, chart);
   }
   const again = () => Object.entries(charts).forEach(([id, chart]) => draw(document.getElementById(id), chart));
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", again);
+  dark.addEventListener("change", again);
 }

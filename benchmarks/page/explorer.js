@@ -18,7 +18,7 @@ class Explorer {
     plot.addEventListener("pointerdown", pointed);
     plot.addEventListener("pointermove", pointed);
     new ResizeObserver(() => this.paint()).observe(this.part("panels"));
-    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.paint());
+    dark.addEventListener("change", () => this.paint());
     this.chosen("task");
   }
 
